@@ -1,0 +1,1 @@
+"""Warp code only: what runs on the device."""
