@@ -1,0 +1,166 @@
+"""Reflection and refraction: evaluate, pdf, sample. wo points to the viewer, wi to the light.
+
+`n` is the shading normal on the side of wo for reflecting materials; a value always carries the cosine of wi.
+Opaque materials reflect alike on both sides.
+"""
+
+import warp as wp
+
+from warpgi.kernels.sampling import (
+    INV_PI,
+    PI,
+    make_frame,
+    square_to_blinn_half_vector,
+    square_to_cosine_hemisphere,
+    to_world,
+)
+from warpgi.kernels.scene import CONDUCTOR, DIELECTRIC, DIFFUSE, MIRROR, ShapeRecord
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class BsdfSample:
+    wi: wp.vec3
+    weight: wp.vec3  # f cos / pdf, for delta lobes the lobe's reflectance over its probability; 0: absorbed
+    pdf: float  # per solid angle; 0 for a delta lobe
+    transmitted: int  # 1: it went through the surface
+    eta: float  # index of refraction crossed, 1 for reflection
+
+
+@wp.func
+def is_delta(kind: int):
+    return kind == MIRROR or kind == DIELECTRIC
+
+
+@wp.func
+def fresnel_conductor(cos_i: float, eta: float, k: float):
+    """Unpolarised reflectance of a conductor, exact (Pharr, Humphreys 2010, sec. 8.2.1 cites the same optics)."""
+    c2 = cos_i * cos_i
+    s2 = 1.0 - c2
+    t0 = eta * eta - k * k - s2
+    a2b2 = wp.sqrt(wp.max(0.0, t0 * t0 + 4.0 * eta * eta * k * k))
+    a = wp.sqrt(wp.max(0.0, 0.5 * (a2b2 + t0)))
+    t1 = a2b2 + c2
+    t2 = 2.0 * cos_i * a
+    rs = (t1 - t2) / (t1 + t2)
+    t3 = c2 * a2b2 + s2 * s2
+    t4 = t2 * s2
+    rp = rs * (t3 - t4) / (t3 + t4)
+    return 0.5 * (rs + rp)
+
+
+@wp.func
+def fresnel_schlick(cos_i: float, reflectance: wp.vec3):
+    """Schlick 1994."""
+    m = 1.0 - cos_i
+    m2 = m * m
+    return reflectance + (wp.vec3(1.0) - reflectance) * (m2 * m2 * m)
+
+
+@wp.func
+def conductor_reflectance(shape: ShapeRecord, albedo: wp.vec3, cos_i: float):
+    if shape.eta[0] > 0.0:
+        return wp.vec3(
+            fresnel_conductor(cos_i, shape.eta[0], shape.k[0]),
+            fresnel_conductor(cos_i, shape.eta[1], shape.k[1]),
+            fresnel_conductor(cos_i, shape.eta[2], shape.k[2]),
+        )
+    return fresnel_schlick(cos_i, albedo)
+
+
+@wp.func
+def fresnel_dielectric(cos_i: float, eta: float):
+    """Unpolarised reflectance at an interface whose far side has `eta` times the near side's index."""
+    sin_t2 = (1.0 - cos_i * cos_i) / (eta * eta)
+    if sin_t2 >= 1.0:
+        return 1.0  # total internal reflection
+    cos_t = wp.sqrt(1.0 - sin_t2)
+    rp = (eta * cos_i - cos_t) / (eta * cos_i + cos_t)
+    rs = (cos_i - eta * cos_t) / (cos_i + eta * cos_t)
+    return 0.5 * (rs * rs + rp * rp)
+
+
+@wp.func
+def evaluate(shape: ShapeRecord, albedo: wp.vec3, n: wp.vec3, wo: wp.vec3, wi: wp.vec3):
+    """f(wo, wi) cos(wi) [1/sr]; 0 for delta lobes, which no given direction meets."""
+    cos_o = wp.dot(n, wo)
+    cos_i = wp.dot(n, wi)
+    if cos_o <= 0.0 or cos_i <= 0.0:
+        return wp.vec3(0.0)
+    if shape.kind == DIFFUSE:
+        return albedo * (cos_i * INV_PI)
+    if shape.kind == CONDUCTOR:
+        # Torrance-Sparrow, Blinn distribution: F D G / (4 cos_o), the cosine of wi cancelled
+        h = wp.normalize(wo + wi)
+        cos_h = wp.dot(n, h)
+        oh = wp.max(wp.dot(wo, h), 1.0e-12)
+        d = (shape.exponent + 2.0) * 0.5 * INV_PI * wp.pow(wp.max(cos_h, 0.0), shape.exponent)
+        g = wp.min(1.0, wp.min(2.0 * cos_h * cos_o / oh, 2.0 * cos_h * cos_i / oh))
+        return conductor_reflectance(shape, albedo, oh) * (d * g / (4.0 * cos_o))
+    return wp.vec3(0.0)
+
+
+@wp.func
+def pdf(shape: ShapeRecord, n: wp.vec3, wo: wp.vec3, wi: wp.vec3):
+    """Density per solid angle with which `sample` returns wi; 0 for delta lobes."""
+    cos_i = wp.dot(n, wi)
+    if cos_i <= 0.0 or wp.dot(n, wo) <= 0.0:
+        return 0.0
+    if shape.kind == DIFFUSE:
+        return cos_i * INV_PI
+    if shape.kind == CONDUCTOR:
+        h = wp.normalize(wo + wi)
+        cos_h = wp.max(wp.dot(n, h), 0.0)
+        return (shape.exponent + 1.0) * wp.pow(cos_h, shape.exponent) / (8.0 * PI * wp.max(wp.dot(wo, h), 1.0e-12))
+    return 0.0
+
+
+@wp.func
+def refract_or_reflect(shape: ShapeRecord, n: wp.vec3, wo: wp.vec3, choice: float):
+    """Smooth glass: one of the two lobes, in proportion to Fresnel; n on the outside."""
+    cos_o = wp.dot(n, wo)
+    eta = wp.where(cos_o >= 0.0, shape.ior, 1.0 / shape.ior)
+    m = wp.where(cos_o >= 0.0, n, -n)
+    cos_o = wp.abs(cos_o)
+    r = fresnel_dielectric(cos_o, eta)
+    s = BsdfSample()
+    s.eta = 1.0
+    s.weight = wp.vec3(1.0)
+    if choice < r:
+        s.wi = m * (2.0 * cos_o) - wo
+    else:
+        cos_t = wp.sqrt(wp.max(0.0, 1.0 - (1.0 - cos_o * cos_o) / (eta * eta)))
+        s.wi = m * (cos_o / eta - cos_t) - wo / eta
+        s.transmitted = 1
+        s.eta = eta
+        s.weight = wp.vec3(1.0 / (eta * eta))  # radiance is compressed into the denser side's smaller solid angle
+    return s
+
+
+@wp.func
+def sample(shape: ShapeRecord, albedo: wp.vec3, n: wp.vec3, wo: wp.vec3, u: wp.vec2):
+    """A direction with pdf as above; for Dielectric n may lie on either side of wo, else on its own."""
+    s = BsdfSample()
+    s.eta = 1.0
+    s.weight = wp.vec3(0.0)
+    if shape.kind == DIFFUSE:
+        local = square_to_cosine_hemisphere(u)
+        s.wi = to_world(make_frame(n), local)
+        s.pdf = local[2] * INV_PI
+        if s.pdf > 0.0:
+            s.weight = albedo
+    elif shape.kind == CONDUCTOR:
+        h = to_world(make_frame(n), square_to_blinn_half_vector(u, shape.exponent))
+        oh = wp.dot(wo, h)
+        s.wi = h * (2.0 * oh) - wo
+        if oh > 0.0:
+            s.pdf = pdf(shape, n, wo, s.wi)
+            if s.pdf > 0.0:
+                s.weight = evaluate(shape, albedo, n, wo, s.wi) / s.pdf
+    elif shape.kind == MIRROR:
+        s.wi = n * (2.0 * wp.dot(n, wo)) - wo
+        s.weight = albedo
+    else:
+        s = refract_or_reflect(shape, n, wo, u[0])
+    return s

@@ -1,0 +1,139 @@
+"""Path tracing (Kajiya 1986) with multiple importance sampling (Veach 1997) and Russian roulette."""
+
+import warp as wp
+
+from warpgi.kernels.bsdf import is_delta, sample
+from warpgi.kernels.camera import Camera, camera_ray
+from warpgi.kernels.direct import (
+    add_features,
+    direct_light,
+    emission_weight,
+    emitted,
+    facing_normal,
+    reflects,
+)
+from warpgi.kernels.film import Film, PathSample, add_sample
+from warpgi.kernels.rng import Sampler, make_sampler, sample_2d
+from warpgi.kernels.scene import DIELECTRIC, Scene, closest_hit, offset_origin, surface_at
+
+wp.set_module_options({"enable_backward": False})
+
+# Pairs of random numbers: two for the camera, then three for each vertex.
+CAMERA_PAIRS = wp.constant(2)
+VERTEX_PAIRS = wp.constant(3)
+
+# Even a path that loses nothing ends some day.
+MAX_SURVIVAL = wp.constant(0.95)
+
+
+@wp.struct
+class PathSettings:
+    max_depth: int  # longest path in segments; 1 sees emitters only
+    roulette_depth: int  # segments after which roulette may end a path
+    sampler: int  # INDEPENDENT or SOBOL
+    seed: int
+
+
+@wp.func
+def add_light(path: PathSample, depth: int, radiance: wp.vec3):
+    """Light that reached the camera over `depth` segments, into its layer."""
+    result = path
+    if depth == 1:
+        result.emission = result.emission + radiance
+    elif depth == 2:
+        result.direct = result.direct + radiance
+    else:
+        result.indirect = result.indirect + radiance
+    return result
+
+
+@wp.func
+def trace_path(scene: Scene, settings: PathSettings, sampler: Sampler, origin: wp.vec3, direction: wp.vec3):
+    path = PathSample()
+    path.depth = -1.0
+    o = origin
+    d = direction
+    throughput = wp.vec3(1.0)
+    bsdf_pdf = float(0.0)  # of the direction d; 0: from the camera or a delta lobe
+    eta_scale = float(1.0)  # product of crossed indices squared, which roulette must not mistake for loss
+    depth = int(1)
+    while True:
+        hit = closest_hit(scene, o, d)
+        path.closest_hit_rays = path.closest_hit_rays + 1
+        if hit.face < 0:
+            # The environment is found by BSDF sampling alone: of a constant one that is the better half.
+            path = add_light(path, depth, wp.cw_mul(throughput, scene.environment))
+            break
+        shape = scene.shapes[scene.face_shapes[hit.face]]
+        s = surface_at(scene, hit, shape)
+        wo = -d
+        if depth == 1:
+            path = add_features(path, s, wo, hit.t)
+
+        # emission
+        le = emitted(shape, s.ng, wo)
+        if le[0] + le[1] + le[2] > 0.0:
+            w = emission_weight(shape, s.ng, d, hit.t, bsdf_pdf)
+            path = add_light(path, depth, wp.cw_mul(throughput, le) * w)
+        last = depth + 1 >= settings.max_depth
+        if depth >= settings.max_depth:
+            break
+
+        # light sampling
+        n = s.n
+        if shape.kind != DIELECTRIC:
+            n = facing_normal(s, wo)
+        pair = CAMERA_PAIRS + VERTEX_PAIRS * (depth - 1)
+        extra = sample_2d(sampler, pair + 2)
+        if scene.light_count > 0 and not is_delta(shape.kind):
+            light = direct_light(scene, shape, s, n, wo, sample_2d(sampler, pair), extra[0], 1)
+            path.shadow_rays = path.shadow_rays + light.shadow_rays
+            path = add_light(path, depth + 1, wp.cw_mul(throughput, light.radiance))
+        if last and scene.visible_light == 0:
+            break  # nothing but a light could still be met, and there is none to meet
+
+        # BSDF sampling
+        b = sample(shape, s.albedo, n, wo, sample_2d(sampler, pair + 1))
+        if b.weight[0] + b.weight[1] + b.weight[2] <= 0.0:
+            break
+        if b.transmitted == 0 and not reflects(s, wo, b.wi):
+            break  # a shading normal sent it through the surface
+        throughput = wp.cw_mul(throughput, b.weight)
+        eta_scale = eta_scale * b.eta * b.eta
+        bsdf_pdf = b.pdf
+
+        # roulette
+        if depth >= settings.roulette_depth:
+            survival = wp.min(MAX_SURVIVAL, wp.max(throughput) * eta_scale)
+            if extra[1] >= survival:
+                break
+            throughput = throughput / survival
+        o = offset_origin(s.p, s.ng, s.offset, b.wi)
+        d = b.wi
+        depth = depth + 1
+    return path
+
+
+@wp.kernel
+def trace_paths(
+    offset: int,
+    scene: Scene,
+    camera: Camera,
+    settings: PathSettings,
+    first_sample: int,
+    sample_count: int,
+    film: Film,
+):
+    """One thread owns one pixel: `sample_count` paths from `first_sample` on, folded into `film`."""
+    i = offset + wp.tid()
+    pixel = film.first_pixel + i
+    x = float(pixel % camera.width)
+    y = float(pixel // camera.width)
+    for index in range(first_sample, first_sample + sample_count):
+        sampler = make_sampler(settings.seed, pixel, index, settings.sampler)
+        u = sample_2d(sampler, 0)
+        lens = wp.vec2(0.0)
+        if camera.lens_radius > 0.0:
+            lens = sample_2d(sampler, 1)
+        ray = camera_ray(camera, x + u[0], y + u[1], lens)
+        add_sample(film, i, trace_path(scene, settings, sampler, ray.o, ray.d))

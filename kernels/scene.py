@@ -1,0 +1,196 @@
+"""The scene on the device: rays against its triangles, what lies at a hit, and where the next ray starts."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+DIFFUSE = wp.constant(0)
+CONDUCTOR = wp.constant(1)
+MIRROR = wp.constant(2)
+DIELECTRIC = wp.constant(3)
+
+FAR = wp.constant(1.0e38)
+
+# A hit position interpolated in float32 is off its plane by a few units in the last place of the triangle's largest
+# coordinate; 32 of them are a safe distance for the next ray (in the spirit of Wächter, Binder 2019).
+OFFSET_ULPS = wp.constant(32.0 * 5.9604645e-8)
+
+# How far a ray that slipped between two triangles is turned for its second try, in radians.
+NUDGE = wp.constant(2.0e-6)
+
+
+@wp.struct
+class ShapeRecord:
+    kind: int  # DIFFUSE, CONDUCTOR, MIRROR or DIELECTRIC
+    albedo: wp.vec3  # of Diffuse; the reflectance of Conductor and Mirror
+    texture: int  # of the albedo, -1: none
+    eta: wp.vec3  # of a Conductor, 0: take Schlick's approximation
+    k: wp.vec3
+    exponent: float  # of the Blinn distribution
+    ior: float
+    emission: wp.vec3  # emitted radiance
+    two_sided: int  # 1: emits on both sides
+    light_pdf: float  # density per area with which light sampling picks a point here
+    has_normals: int
+    has_uv: int
+
+
+@wp.struct
+class TextureRecord:
+    start: int  # of its texels
+    width: int
+    height: int
+
+
+@wp.struct
+class LightRecord:
+    face: int  # of an emissive triangle, else -1
+    distant: int  # 1: parallel light
+    position: wp.vec3
+    direction: wp.vec3  # axis of a spot; where parallel light travels
+    radiance: wp.vec3  # emitted radiance, intensity or irradiance
+    cone_scale: float  # KHR_lights_punctual: clamp(cos * scale + offset, 0, 1)^2; (0, 1) is a point light
+    cone_offset: float
+
+
+@wp.struct
+class Scene:
+    mesh: wp.uint64
+    points: wp.array[wp.vec3]  # relative to the scene's centre
+    indices: wp.array[int]
+    face_normals: wp.array[wp.vec3]
+    face_shapes: wp.array[int]
+    shapes: wp.array[ShapeRecord]
+    normals: wp.array[wp.vec3]  # empty where no shape has them
+    uvs: wp.array[wp.vec2]  # empty where no shape has them
+    textures: wp.array[TextureRecord]
+    texels: wp.array[wp.vec3h]
+    lights: wp.array[LightRecord]
+    light_cdf: wp.array[float]  # running sum of the lights' shares of the power
+    light_count: int
+    environment: wp.vec3
+    visible_light: int  # 1: a ray that is not aimed at a light can find one
+    watertight: int  # 1: every edge has two triangles, so that a miss may be a leak
+
+
+@wp.struct
+class Hit:
+    face: int  # -1: none
+    t: float
+    u: float  # barycentric, of the triangle's first and second corner
+    v: float
+
+
+@wp.struct
+class Surface:
+    p: wp.vec3
+    ng: wp.vec3  # geometric normal, counter-clockwise side
+    n: wp.vec3  # shading normal on the same side as ng
+    albedo: wp.vec3
+    offset: float  # distance from the plane at which a new ray starts
+
+
+@wp.func
+def perpendicular(d: wp.vec3):
+    if wp.abs(d[0]) < 0.7:
+        return wp.normalize(wp.cross(d, wp.vec3(1.0, 0.0, 0.0)))
+    return wp.normalize(wp.cross(d, wp.vec3(0.0, 1.0, 0.0)))
+
+
+@wp.func
+def closest_hit(scene: Scene, o: wp.vec3, d: wp.vec3):
+    q = wp.mesh_query_ray(scene.mesh, o, d, FAR)
+    if not q.result and scene.watertight != 0:
+        # Warp's box test is not conservative: a ray at an edge may slip through. Aim beside it, then at the other side.
+        side = perpendicular(d) * NUDGE
+        q = wp.mesh_query_ray(scene.mesh, o, d + side, FAR)
+        if not q.result:
+            q = wp.mesh_query_ray(scene.mesh, o, d - side, FAR)
+    h = Hit()
+    h.face = -1
+    if q.result:
+        h.face = q.face
+        h.t = q.t
+        h.u = q.u
+        h.v = q.v
+    return h
+
+
+@wp.func
+def occluded(scene: Scene, o: wp.vec3, d: wp.vec3, distance: float):
+    return wp.mesh_query_ray_anyhit(scene.mesh, o, d, distance)
+
+
+@wp.func
+def max_abs(v: wp.vec3):
+    return wp.max(wp.max(wp.abs(v[0]), wp.abs(v[1])), wp.abs(v[2]))
+
+
+@wp.func
+def ray_offset(a: wp.vec3, b: wp.vec3, c: wp.vec3):
+    """Distance from the plane of triangle abc at which a ray can start without meeting it again."""
+    return OFFSET_ULPS * wp.max(wp.max(max_abs(a), max_abs(b)), max_abs(c))
+
+
+@wp.func
+def offset_origin(p: wp.vec3, ng: wp.vec3, offset: float, d: wp.vec3):
+    """Start of a ray from p along d, on the side of the surface to which d points."""
+    return p + ng * wp.where(wp.dot(ng, d) >= 0.0, offset, -offset)
+
+
+@wp.func
+def texel(scene: Scene, texture: TextureRecord, x: int, y: int):
+    value = scene.texels[texture.start + y * texture.width + x]
+    return wp.vec3(float(value[0]), float(value[1]), float(value[2]))
+
+
+@wp.func
+def wrap(i: int, n: int):
+    m = i % n
+    return wp.where(m < 0, m + n, m)
+
+
+@wp.func
+def lookup(scene: Scene, index: int, uv: wp.vec2):
+    """Bilinear interpolation of a repeated image; v = 1 is its first row."""
+    texture = scene.textures[index]
+    x = (uv[0] - wp.floor(uv[0])) * float(texture.width) - 0.5
+    y = (1.0 - (uv[1] - wp.floor(uv[1]))) * float(texture.height) - 0.5
+    x0 = int(wp.floor(x))
+    y0 = int(wp.floor(y))
+    fx = x - float(x0)
+    fy = y - float(y0)
+    left = wrap(x0, texture.width)
+    right = wrap(x0 + 1, texture.width)
+    top = wrap(y0, texture.height)
+    bottom = wrap(y0 + 1, texture.height)
+    upper = texel(scene, texture, left, top) * (1.0 - fx) + texel(scene, texture, right, top) * fx
+    lower = texel(scene, texture, left, bottom) * (1.0 - fx) + texel(scene, texture, right, bottom) * fx
+    return upper * (1.0 - fy) + lower * fy
+
+
+@wp.func
+def surface_at(scene: Scene, h: Hit, shape: ShapeRecord):
+    """Position, normals and albedo at a hit; the position from the corners, as t carries the ray's rounding."""
+    i = scene.indices[3 * h.face]
+    j = scene.indices[3 * h.face + 1]
+    k = scene.indices[3 * h.face + 2]
+    a = scene.points[i]
+    b = scene.points[j]
+    c = scene.points[k]
+    w = 1.0 - h.u - h.v
+    s = Surface()
+    s.p = a * h.u + b * h.v + c * w
+    s.ng = scene.face_normals[h.face]
+    s.offset = ray_offset(a, b, c)
+    s.n = s.ng
+    if shape.has_normals != 0:
+        n = wp.normalize(scene.normals[i] * h.u + scene.normals[j] * h.v + scene.normals[k] * w)
+        side = wp.dot(n, s.ng)
+        if side != 0.0:
+            s.n = n * wp.sign(side)
+    s.albedo = shape.albedo
+    if shape.texture >= 0:
+        uv = scene.uvs[i] * h.u + scene.uvs[j] * h.v + scene.uvs[k] * w
+        s.albedo = wp.cw_mul(s.albedo, lookup(scene, shape.texture, uv))
+    return s
