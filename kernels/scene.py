@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from warpgi.kernels.triangles import TriangleTree, walk
+
 wp.set_module_options({"enable_backward": False})
 
 DIFFUSE = wp.constant(0)
@@ -14,10 +16,6 @@ FAR = wp.constant(1.0e38)
 # A hit position interpolated in float32 is off its plane by a few units in the last place of the triangle's largest
 # coordinate; 32 of them are a safe distance for the next ray (in the spirit of Wächter, Binder 2019).
 OFFSET_ULPS = wp.constant(32.0 * 5.9604645e-8)
-
-# How far a ray that slipped between two triangles is turned for its second try, in radians.
-NUDGE = wp.constant(2.0e-6)
-
 
 @wp.struct
 class ShapeRecord:
@@ -55,7 +53,7 @@ class LightRecord:
 
 @wp.struct
 class Scene:
-    mesh: wp.uint64
+    tree: TriangleTree
     points: wp.array[wp.vec3]  # relative to the scene's centre
     indices: wp.array[int]
     face_normals: wp.array[wp.vec3]
@@ -70,7 +68,6 @@ class Scene:
     light_count: int
     environment: wp.vec3
     visible_light: int  # 1: a ray that is not aimed at a light can find one
-    watertight: int  # 1: every edge has two triangles, so that a miss may be a leak
 
 
 @wp.struct
@@ -91,34 +88,19 @@ class Surface:
 
 
 @wp.func
-def perpendicular(d: wp.vec3):
-    if wp.abs(d[0]) < 0.7:
-        return wp.normalize(wp.cross(d, wp.vec3(1.0, 0.0, 0.0)))
-    return wp.normalize(wp.cross(d, wp.vec3(0.0, 1.0, 0.0)))
-
-
-@wp.func
 def closest_hit(scene: Scene, o: wp.vec3, d: wp.vec3):
-    q = wp.mesh_query_ray(scene.mesh, o, d, FAR)
-    if not q.result and scene.watertight != 0:
-        # Warp's box test is not conservative: a ray at an edge may slip through. Aim beside it, then at the other side.
-        side = perpendicular(d) * NUDGE
-        q = wp.mesh_query_ray(scene.mesh, o, d + side, FAR)
-        if not q.result:
-            q = wp.mesh_query_ray(scene.mesh, o, d - side, FAR)
+    found = walk(scene.tree, o, d, FAR, 0)
     h = Hit()
-    h.face = -1
-    if q.result:
-        h.face = q.face
-        h.t = q.t
-        h.u = q.u
-        h.v = q.v
+    h.t = found[0]
+    h.u = found[1]
+    h.v = found[2]
+    h.face = wp.cast(found[3], wp.int32)
     return h
 
 
 @wp.func
 def occluded(scene: Scene, o: wp.vec3, d: wp.vec3, distance: float):
-    return wp.mesh_query_ray_anyhit(scene.mesh, o, d, distance)
+    return wp.cast(walk(scene.tree, o, d, distance, 1)[3], wp.int32) >= 0
 
 
 @wp.func

@@ -63,7 +63,8 @@ class Device:
     def load(self, kernels: Iterable[wp.Kernel]) -> None:
         """Compiles what is not compiled yet and loads it; threads must not do it at the same time."""
         for module in {kernel.module for kernel in kernels}:
-            module.load(self.warp)
+            # a launch on cpu asks for blocks of one thread; without that the module would be compiled twice
+            module.load(self.warp, None if self.is_cuda else 1)
 
     def launch(self, kernel: wp.Kernel, count: int, inputs: Sequence[Any], outputs: Sequence[Any] = ()) -> None:
         """Runs `kernel` for the indices 0 to count - 1 and returns when all are done on cpu, at once on cuda.

@@ -1,4 +1,4 @@
-"""The scene's arrays on a device, and its `wp.Mesh`."""
+"""The scene's arrays on a device."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ import warp as wp
 from warpgi.device import Device
 from warpgi.kernels import camera as camera_kernels
 from warpgi.kernels import scene as kernels
+from warpgi.kernels import triangles as triangle_kernels
 from warpgi.lights import DistantLight, Environment, PointLight, SpotLight
 from warpgi.materials import Conductor, Dielectric, Diffuse, Material, Mirror, Texture
 from warpgi.scene import Scene, Shape
+from warpgi.triangle_tree import build_triangle_tree
 
 KINDS = {
     Diffuse: kernels.DIFFUSE,
@@ -19,19 +21,13 @@ KINDS = {
     Dielectric: kernels.DIELECTRIC,
 }
 
-# Triangles a leaf of the ray hierarchy: measured fastest on the Cornell box and on 330 000 triangles.
-LEAF_SIZE = 4
-SMALL_LEAF_SIZE = 2
-SMALL_SCENE = 4096  # triangles
-
-
 class DeviceScene:
     """What kernels see of a scene, positions taken relative to its centre so that float32 serves far-away scenes.
 
     Attributes:
         struct: the `kernels.scene.Scene` argument of kernels.
         centre: float64 world position of the device's origin, shape (3,).
-        nbytes: bytes of all arrays on the device, the ray hierarchy's estimated.
+        nbytes: bytes of all arrays on the device.
     """
 
     def __init__(self, scene: Scene, device: Device) -> None:
@@ -86,15 +82,10 @@ class DeviceScene:
         struct.face_shapes = self._upload(shape_of_face, int)
         struct.normals = self._upload(_per_vertex([s.normals for s in shapes], starts, 3), wp.vec3)
         struct.uvs = self._upload(_per_vertex([s.uv for s in shapes], starts, 2), wp.vec2)
-        leaf = SMALL_LEAF_SIZE if len(faces) <= SMALL_SCENE else LEAF_SIZE
-        # sah is the best tree to walk; on cuda it is built on the host all the same
-        self.mesh = wp.Mesh(struct.points, struct.indices, bvh_constructor="sah", bvh_leaf_size=leaf)
-        self.nbytes += 2 * len(faces) * 40
-        struct.mesh = self.mesh.id
-        low, high = points.min(axis=0), points.max(axis=0)
-        eye = np.asarray(self.scene.camera.position) - self.centre
-        inside = bool(np.all(eye > low) and np.all(eye < high))
-        struct.watertight = int(inside and _every_edge_is_shared(points.astype(np.float32), faces))
+        tree = triangle_kernels.TriangleTree()
+        for name, values in build_triangle_tree(points.astype(np.float32), faces).items():
+            setattr(tree, name, self._upload(values, float if values.dtype == np.float32 else int))
+        struct.tree = tree
 
     def _add_textures(self) -> None:
         self._textures: dict[int, int] = {}
@@ -214,23 +205,3 @@ def _per_vertex(parts: list[np.ndarray | None], starts: np.ndarray, width: int) 
         if part is not None:
             values[start : start + len(part)] = part
     return values
-
-
-def _every_edge_is_shared(points: np.ndarray, faces: np.ndarray) -> bool:
-    """Whether every edge, by the positions of its ends, belongs to an even number of triangles.
-
-    Edges are hashed and the hashes combined by exclusive or, so that pairs vanish and nothing is sorted.
-    """
-    bits = (points + 0.0).view(np.uint32).astype(np.uint64)  # + 0.0 makes -0 and 0 one
-    vertex = _mix64(bits[:, 0] ^ _mix64(bits[:, 1] ^ _mix64(bits[:, 2])))
-    corner = vertex[faces]
-    edges = _mix64(corner + corner[:, [1, 2, 0]])
-    return not bool(np.bitwise_xor.reduce(edges, axis=None))
-
-
-def _mix64(value: np.ndarray) -> np.ndarray:
-    """Finaliser of SplitMix64 (Steele, Lea, Flood 2014)."""
-    value = value + np.uint64(0x9E3779B97F4A7C15)
-    value = (value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    value = (value ^ (value >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return value ^ (value >> np.uint64(31))

@@ -1,7 +1,7 @@
 """Scenes from glTF 2.0 (Khronos 2021): the triangles through trimesh, all else from the JSON.
 
-trimesh (5.2 was read) drops lights, emissive strengths and every camera but a root one, and hides the children of a camera node. So it is
-given a document that holds nothing but one mesh per primitive, named by its indices; nodes and materials are ours.
+trimesh (5.2) drops lights and emissive strengths, keeps one camera without its parents, and hides what hangs below a
+camera node. So it gets a document of one mesh per primitive, named by its indices; nodes and materials are read here.
 """
 
 from __future__ import annotations
@@ -163,7 +163,9 @@ class _Reader:
                 for accessor in (*attributes.values(), *([primitive["indices"]] if "indices" in primitive else [])):
                     item = self.document["accessors"][accessor]
                     if "sparse" in item or "bufferView" not in item:  # trimesh would read zeros
-                        raise SceneFileError(f"its accessor {accessor} is sparse or without data, which is not supported")
+                        raise SceneFileError(
+                            f"its accessor {accessor} is sparse or without data, which is not supported"
+                        )
                 meshes.append({"name": f"{i}.{j}", "primitives": [stripped]})
         if not meshes:
             return {}
@@ -284,7 +286,11 @@ def _tinted(material: Material, colours: np.ndarray, name: str) -> Material:
 
 
 def _uv(uv: np.ndarray, extension: dict[str, Any]) -> np.ndarray:
-    """KHR_texture_transform applied, and v turned over: glTF's origin is the upper left corner."""
+    """KHR_texture_transform applied, and v turned over: glTF's origin is the upper left corner.
+
+    It turns counter-clockwise as seen, so with v downwards; the extension's text and its example say so, its GLSL
+    does not.
+    """
     if extension:
         angle = extension.get("rotation", 0.0)
         cos, sin = math.cos(angle), math.sin(angle)

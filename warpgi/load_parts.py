@@ -79,17 +79,24 @@ class Parts:
         if normals is not None:
             normals = _unit_normals(normals, vertices, faces)
 
-        texture_field = "albedo" if isinstance(material, Diffuse) else "reflectance"
-        texture = getattr(material, texture_field, None)
-        if isinstance(texture, Texture) and uv is None:
+        textured = isinstance(getattr(material, "albedo", getattr(material, "reflectance", None)), Texture)
+        if textured and uv is None:
             warnings.warn(f"{name} has no texture coordinates, its texture became its mean colour", stacklevel=2)
-            material = dataclasses.replace(material, **{texture_field: mean_colour(texture)})
+            material = _without_texture(material)
         try:
-            shape = Shape(vertices, faces, material, emission, normals, uv if isinstance(texture, Texture) else None, name)
+            shape = Shape(vertices, faces, material, emission, normals, uv if textured else None, name)
         except ValueError:  # everything else a Shape refuses was checked above: no triangle has an area
             self.empty.append(name)
             return
         self.shapes.append(shape)
+
+
+def _without_texture(material: Material) -> Material:
+    if isinstance(material, Diffuse):
+        return Diffuse(mean_colour(material.albedo))
+    if isinstance(material, Dielectric):
+        return material
+    return dataclasses.replace(material, reflectance=mean_colour(material.reflectance))
 
 
 def _unit_normals(normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -115,14 +122,14 @@ def fan(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([first, first + step + 1, first + step + 2], axis=1), polygon
 
 
-def asset_path(folder: Path, reference: str, what: str) -> Path:
-    """The file that `reference` names from `folder`, with links resolved.
+def asset_path(folder: Path, reference: str, what: str, base: Path | None = None) -> Path:
+    """The file that `reference` names from `base`, which is `folder` itself unless given, with links resolved.
 
     Raises:
         SceneFileError: it lies outside `folder`, however it says so: absolute, by `..` or through a link.
     """
     root = folder.resolve()
-    resolved = (root / reference.replace("\\", "/")).resolve()
+    resolved = ((base or root) / reference.replace("\\", "/")).resolve()
     if not resolved.is_relative_to(root):
         raise SceneFileError(f"{what} {reference!r} lies outside the scene's folder {str(root)!r}, which is refused")
     return resolved
