@@ -17,6 +17,7 @@ FAR = wp.constant(1.0e38)
 # coordinate; 32 of them are a safe distance for the next ray (in the spirit of Wächter, Binder 2019).
 OFFSET_ULPS = wp.constant(32.0 * 5.9604645e-8)
 
+
 @wp.struct
 class ShapeRecord:
     kind: int  # DIFFUSE, CONDUCTOR, MIRROR or DIELECTRIC

@@ -1,22 +1,27 @@
 """Global illumination on NVIDIA Warp: a path tracer as the reference, and methods that make indirect light cheap."""
 
+__version__ = "0.1.0"
+
+from warpgi import scenes
 from warpgi.camera import Camera
-from warpgi.lights import DistantLight, Environment, PointLight, SpotLight
 from warpgi.device import Device
+from warpgi.lights import DistantLight, Environment, PointLight, SpotLight
+from warpgi.load import load_scene
 from warpgi.materials import Conductor, Dielectric, Diffuse, Emissive, Mirror, Texture
 from warpgi.methods import METHODS, PathTracing, Sampler
+from warpgi.metrics import compare
 from warpgi.progress import Progress
-from warpgi.render import Interrupted, render
+from warpgi.render import Interrupted, render, versions
+from warpgi.result import Render
 from warpgi.scene import Scene, Shape
 
-__version__ = "0.1.0"
 __all__ = [
     "METHODS",
     "Camera",
     "Conductor",
+    "Device",
     "Dielectric",
     "Diffuse",
-    "Device",
     "DistantLight",
     "Emissive",
     "Environment",
@@ -25,10 +30,15 @@ __all__ = [
     "PathTracing",
     "PointLight",
     "Progress",
+    "Render",
     "Sampler",
     "Scene",
     "Shape",
     "SpotLight",
     "Texture",
+    "compare",
+    "load_scene",
     "render",
+    "scenes",
+    "versions",
 ]

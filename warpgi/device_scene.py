@@ -21,6 +21,7 @@ KINDS = {
     Dielectric: kernels.DIELECTRIC,
 }
 
+
 class DeviceScene:
     """What kernels see of a scene, positions taken relative to its centre so that float32 serves far-away scenes.
 
@@ -102,9 +103,7 @@ class DeviceScene:
             texels.append(texture.pixels.reshape(-1, 3).astype(np.float16))
             start += width * height
         self.struct.textures = self._upload(records, kernels.TextureRecord)  # type: ignore[arg-type]
-        self.struct.texels = self._upload(
-            np.concatenate(texels) if texels else np.zeros((0, 3), np.float16), wp.vec3h
-        )
+        self.struct.texels = self._upload(np.concatenate(texels) if texels else np.zeros((0, 3), np.float16), wp.vec3h)
 
     def _add_lights_and_shapes(self) -> None:
         density: dict[int, float] = {}  # power per area of emissive shapes

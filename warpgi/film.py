@@ -105,7 +105,7 @@ class Film:
         met = self.field("surface_count")[:, None] > 0
         position = np.where(met, self.field("position") + centre, 0.0).astype(np.float32)
         layers["position"] = position.reshape(self.height, self.width, 3)
-        layers["depth"] = np.where(met[:, 0], self.field("depth"), np.inf).reshape(self.height, self.width, 1)
+        layers["depth"] = np.where(met[:, 0], self.field("depth"), np.float32(0.0)).reshape(self.height, self.width, 1)
         count = self.field("count")[:, None].astype(np.float64)
         # one sample tells nothing of its variance
         variance = np.where(count > 1, self.field("squares") / np.maximum(count * (count - 1), 1.0), 0.0)

@@ -46,7 +46,9 @@ class SpotLight:
         checks.number("outer_angle", self.outer_angle, 0.0, math.pi / 2, open_lower=True)
         checks.number("inner_angle", self.inner_angle, 0.0)
         if self.inner_angle >= self.outer_angle:
-            raise ValueError(f"inner_angle is {self.inner_angle:g}, expected less than outer_angle {self.outer_angle:g}")
+            raise ValueError(
+                f"inner_angle is {self.inner_angle:g}, expected less than outer_angle {self.outer_angle:g}"
+            )
 
 
 @dataclass(frozen=True)

@@ -93,13 +93,14 @@ def read_obj(path: Path) -> Parts:
     # trimesh finds a statement by "\nf " and the like, and reads commented ones too.
     text = "\n" + re.sub(r"(?m)^[ \t]*(#.*)?|[ \t]+$", "", text.replace("\t", " ")) + "\n"
     materials = _materials(text, path)
-    names = list(dict.fromkeys(re.findall(r"(?m)^usemtl +(.*)$", text)))
+    numbers = {name: i for i, name in enumerate(dict.fromkeys(re.findall(r"(?m)^usemtl +(.*)$", text)))}
+    names = list(numbers)
 
     # Its own reading of a .mtl opens textures and drops errors, so it gets one of names only: 0, 1, ...
     text = re.sub(r"(?m)^mtllib.*$", "", text)
-    text = re.sub(r"(?m)^usemtl +(.*)$", lambda match: f"usemtl {names.index(match[1])}", text)
+    text = re.sub(r"(?m)^usemtl +(.*)$", lambda match: f"usemtl {numbers[match[1]]}", text)
     text = "mtllib names\n" + _absolute_indices(text)
-    stub = "".join(f"newmtl {i}\n" for i in range(len(names) + 2))
+    stub = "".join(f"newmtl {i}\n" for i in range(len(names)))
     with warnings.catch_warnings():
         # numpy only warns where it stops in the middle of the numbers.
         warnings.filterwarnings("error", message="string or file could not be read", category=DeprecationWarning)
@@ -109,10 +110,16 @@ def read_obj(path: Path) -> Parts:
             raise SceneFileError("its faces or vertices hold something that is no number") from error
 
     parts = Parts()
-    for key, mesh in reversed(loaded.get("geometry", {}).items()):  # trimesh pops them from the end
-        name = names[int(key)] if key.isdigit() else path.stem
+    meshes = loaded.get("geometry", {"": loaded})  # before 5.0 trimesh gives a single mesh as it is
+    for mesh in reversed(meshes.values()):  # and always pops them from the end of the file
+        visual = mesh.get("visual")
+        number = str(getattr(getattr(visual, "material", None), "name", ""))
+        name = names[int(number)] if number.isdigit() else path.stem
+        if "faces" not in mesh:
+            parts.empty.append(name)
+            continue
         material, emission = materials[name] if name in materials else (_vertex_colour(mesh, name), None)
-        uv = getattr(mesh.get("visual"), "uv", None)
+        uv = getattr(visual, "uv", None)
         parts.add(
             name,
             mesh["vertices"],

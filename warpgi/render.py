@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+import warpgi
 from warpgi import checks
 from warpgi.device import Device, as_device
 from warpgi.device_scene import DeviceScene
@@ -118,10 +119,8 @@ def render(
 
 def versions() -> dict[str, str]:
     """Versions of what a picture depends on."""
-    from warpgi import __version__
-
     return {
-        "warpgi": __version__,
+        "warpgi": warpgi.__version__,
         "warp": wp.config.version,
         "numpy": np.__version__,
         "python": platform.python_version(),

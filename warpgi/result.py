@@ -35,7 +35,7 @@ LAYERS: Mapping[str, Layer] = {
     "image": Layer(
         ("R", "G", "B"),
         "the whole radiance [W/(sr m^2)]; a layer only where it is not the sum of emission, direct and indirect",
-        ("", "combined"),
+        ("combined",),
     ),
     "emission": Layer(
         ("emission.R", "emission.G", "emission.B"),
@@ -255,13 +255,13 @@ def _known_layers(path: str, channels: dict[str, np.ndarray]) -> dict[str, np.nd
             layers[name] = _stack(path, name, [channels[channel] for channel in layer.channels])
             continue
         for alias in layer.aliases:
-            found = {
-                group: [letters[letter] for letter in spelling]
-                for group, letters in groups.items()
-                # The first spelling wins; without a layer's name it is the only one: pbrt has a "v" of another kind.
-                for spelling in reversed(layer.spellings if alias else layer.spellings[:1])
-                if alias in (group.lower(), group.rpartition(".")[2].lower()) and set(spelling) <= set(letters)
-            }
+            # Without a layer's name the first spelling is the only one: pbrt has a "v" of another kind.
+            spellings = layer.spellings if alias else layer.spellings[:1]
+            found = {}
+            for group, letters in groups.items():
+                spelling = next((s for s in spellings if set(s) <= set(letters)), None)
+                if spelling and alias in (group.lower(), group.rpartition(".")[2].lower()):
+                    found[group] = [letters[letter] for letter in spelling]
             if len(found) > 1:  # older Blenders add a view layer of what the compositor made
                 found = {group: pixels for group, pixels in found.items() if not group.lower().startswith("composite.")}
             if len(found) > 1:

@@ -1,0 +1,1 @@
+"""Measurements, `python -m bench` in a checkout; no part of the wheel."""

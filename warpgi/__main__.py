@@ -1,0 +1,211 @@
+"""The command line: the library's own calls, their settings as options, their errors in one sentence."""
+
+from __future__ import annotations
+
+import ast
+import sys
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Union
+
+import numpy as np
+import tyro
+
+import warpgi as gi
+from warpgi.image import check_output
+from warpgi.load import SUFFIXES
+
+MISUSE = 2  # exit status for a caller's mistake
+INTERRUPTED = 130
+
+# One subcommand a method; the table decides, so that a new method is here by being listed.
+METHOD_SETTINGS = tyro.extras.subcommand_type_from_defaults(
+    {name: kind() for name, kind in gi.METHODS.items()},
+    {name: (kind.__doc__ or "").strip().splitlines()[0] for name, kind in gi.METHODS.items()},
+)
+
+
+@dataclass(frozen=True)
+class RenderCommand:
+    """Render a scene and write the picture."""
+
+    scene: tyro.conf.Positional[str]
+    """A built-in scene, with parameters as in courtyard:detail=0.2, or a .glb, .gltf, .obj, .ply, .stl or .usd file."""
+    method: METHOD_SETTINGS = field(default_factory=gi.PathTracing)  # type: ignore[valid-type]
+    """How to render it; path tracing by default."""
+    size: tuple[int, int] = (256, 256)
+    """Width and height in pixels."""
+    seed: int = 0
+    """Which random numbers."""
+    out: tyro.conf.UseAppendAction[tuple[Path, ...]] = ()
+    """Where the picture goes: .exr with all layers, .png tone-mapped; may be given more than once."""
+    exposure: float = 0.0
+    """Stops by which a .png is brightened."""
+    device: str | None = None
+    """cpu, cuda:0, ...; a GPU if there is one."""
+    threads: int | None = None
+    """CPU threads; all by default."""
+    memory_limit: float = 3.0
+    """GiB that the render's arrays may take on the device."""
+
+    def run(self) -> None:
+        for path in self.out:
+            check_output(path)
+        if not self.out:
+            _warn("no --out FILE.exr or --out FILE.png: the picture will not be kept")
+        if not self.memory_limit > 0.0:
+            raise ValueError(f"memory-limit is {self.memory_limit:g} GiB, expected a number above 0")
+        device = gi.Device(self.device, self.threads, int(self.memory_limit * 2**30))
+        scene = _open_scene(self.scene)
+        try:
+            picture = gi.render(scene, self.method, self.size, self.seed, device, progress=sys.stderr.isatty())
+        except gi.Interrupted as stop:
+            if stop.render is not None:
+                self._keep(stop.render)
+                total = self.method.spp
+                print(f"interrupted: the picture holds {stop.render.spp} of {total} samples per pixel")
+            raise
+        self._keep(picture)
+
+    def _keep(self, picture: gi.Render) -> None:
+        for path in self.out:
+            picture.save(path, exposure=self.exposure) if path.suffix.lower() == ".png" else picture.save(path)
+        stages = ", ".join(f"{stage} {seconds:.2f} s" for stage, seconds in picture.timings.items() if seconds >= 0.005)
+        height, width = picture.image.shape[:2]
+        print(f"{picture.scene}, {picture.method}, {picture.spp} spp, {width} x {height} on {picture.device}: {stages}")
+        rays = picture.counts["closest_hit_rays"] + picture.counts["shadow_rays"]
+        print(f"{rays} rays, {rays / max(picture.timings['estimate'], 1e-9) / 1e6:.2f} M rays/s")
+        if picture.counts["nonfinite"]:
+            _warn(f"{picture.counts['nonfinite']} samples were not finite and were dropped")
+        if picture.counts["degenerate_triangles"]:
+            _warn(f"{picture.counts['degenerate_triangles']} triangles without area were dropped")
+        for path in self.out:
+            print(f"wrote {path}")
+
+
+@dataclass(frozen=True)
+class CompareCommand:
+    """Compare two pictures of one size: relMSE, RMSE, PSNR and FLIP."""
+
+    image: tyro.conf.Positional[Path]
+    """The .exr to judge."""
+    reference: tyro.conf.Positional[Path]
+    """The .exr to judge it by."""
+    layer: str = "image"
+    """Which layer: image, indirect, direct, ..."""
+
+    def run(self) -> None:
+        images = [_layer(path, self.layer) for path in (self.image, self.reference)]
+        for name, value in gi.compare(*images).items():
+            print(f"{name:8s}{'flip-evaluator is not installed' if value is None else f'{value:.6g}'}")
+
+
+@dataclass(frozen=True)
+class ScenesCommand:
+    """List the built-in scenes."""
+
+    def run(self) -> None:
+        _table(gi.scenes.SCENES)
+
+
+@dataclass(frozen=True)
+class MethodsCommand:
+    """List the methods."""
+
+    def run(self) -> None:
+        _table(gi.METHODS)
+
+
+@dataclass(frozen=True)
+class InfoCommand:
+    """Show versions, devices and where compiled kernels are kept."""
+
+    def run(self) -> None:
+        import warp as wp
+
+        device = gi.Device()
+        for name, version in gi.versions().items():
+            print(f"{name:14s}{version}")
+        print(f"{'device':14s}{device.name} ({device.warp.name})")
+        print(f"{'threads':14s}{device.threads}")
+        print(f"{'kernel cache':14s}{wp.config.kernel_cache_dir}")
+        print(f"{'scene files':14s}{' '.join(SUFFIXES)}")
+
+
+COMMANDS = Union[
+    Annotated[RenderCommand, tyro.conf.subcommand("render")],
+    Annotated[CompareCommand, tyro.conf.subcommand("compare")],
+    Annotated[ScenesCommand, tyro.conf.subcommand("scenes")],
+    Annotated[MethodsCommand, tyro.conf.subcommand("methods")],
+    Annotated[InfoCommand, tyro.conf.subcommand("info")],
+]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs one command and returns its exit status: 0, or 2 for a caller's mistake, or 130 after Ctrl-C."""
+    options = (
+        tyro.conf.OmitArgPrefixes,
+        tyro.conf.OmitSubcommandPrefixes,
+        tyro.conf.CascadeSubcommandArgs,
+        tyro.conf.EnumChoicesFromValues,
+    )
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = lambda message, *_: _warn(str(message))  # type: ignore[assignment]
+            warnings.simplefilter("always", UserWarning)
+            warnings.simplefilter("always", RuntimeWarning)
+            command: Any = tyro.cli(COMMANDS, prog="warpgi", args=arguments, config=options)  # type: ignore[call-overload]
+            command.run()
+    except KeyboardInterrupt:
+        print("warpgi: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except (ValueError, TypeError, OSError) as error:
+        print(f"warpgi: error: {error}", file=sys.stderr)
+        return MISUSE
+    return 0
+
+
+def _open_scene(text: str) -> gi.Scene:
+    """A file where there is one or the name looks like one, else a built-in scene with its parameters."""
+    if Path(text).suffix.lower() in SUFFIXES or Path(text).exists():
+        return gi.load_scene(text)
+    name, _, rest = text.partition(":")
+    parameters: dict[str, Any] = {}
+    for item in filter(None, rest.split(",")):
+        key, equals, value = item.partition("=")
+        if not equals:
+            raise ValueError(f"scene is {text!r}, expected parameters as in courtyard:detail=0.2")
+        try:
+            parameters[key] = ast.literal_eval(value)
+        except (ValueError, SyntaxError):
+            parameters[key] = value
+    return gi.scenes.build(name, **parameters)
+
+
+def _layer(path: Path, name: str) -> np.ndarray:
+    picture = gi.Render.load(path)
+    if name == "image":
+        return picture.image
+    if name not in picture.layers:
+        raise ValueError(f"layer {name!r} is not in {path}, expected one of image, {', '.join(picture.layers)}")
+    return picture.layers[name]
+
+
+def _table(items: dict[str, Callable[..., Any]]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, show_header=False)
+    for name, item in items.items():
+        table.add_row(name, (item.__doc__ or "").strip().splitlines()[0])
+    Console().print(table)
+
+
+def _warn(message: str) -> None:
+    print(f"warpgi: warning: {message}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
