@@ -25,6 +25,10 @@ class MissingPeer(ValueError):
     """Mitsuba is not installed."""
 
 
+class NoCounterpart(ValueError):
+    """A scene holds something that Mitsuba would render otherwise."""
+
+
 class MitsubaPeer:
     """A scene loaded into Mitsuba, to be rendered over and over.
 
@@ -36,7 +40,7 @@ class MitsubaPeer:
 
     Raises:
         MissingPeer: Mitsuba is not installed.
-        ValueError: the scene holds something that has no exact counterpart here.
+        NoCounterpart: the scene holds something else.
     """
 
     def __init__(self, scene: Scene, size: tuple[int, int], max_depth: int, threads: int) -> None:
@@ -64,10 +68,10 @@ def export_scene(scene: Scene, size: tuple[int, int], max_depth: int, folder: Pa
     """The dictionary that `mitsuba.load_dict` takes; triangles go through PLY files in `folder`.
 
     Raises:
-        ValueError: the scene holds something that has no exact counterpart here.
+        NoCounterpart: the scene holds something else.
     """
     if scene.lights:
-        raise ValueError(f"scene {scene.name} has lights beside its shapes, expected none for Mitsuba")
+        raise NoCounterpart(f"scene {scene.name} has lights beside its shapes, expected none for Mitsuba")
     result = {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": max_depth, "rr_depth": NEVER},
@@ -106,14 +110,14 @@ def _sensor(camera: Camera, size: tuple[int, int]) -> dict[str, Any]:
 
 def _surface(shape: Shape) -> dict[str, Any]:
     if not isinstance(shape.material, Diffuse) or isinstance(shape.material.albedo, Texture):
-        raise ValueError(f"{shape.name} is not Diffuse of one colour, expected that for Mitsuba")
+        raise NoCounterpart(f"{shape.name} is not Diffuse of one colour, expected that for Mitsuba")
     if shape.normals is not None:
-        raise ValueError(f"{shape.name} has vertex normals, expected flat triangles for Mitsuba")
+        raise NoCounterpart(f"{shape.name} has vertex normals, expected flat triangles for Mitsuba")
     diffuse = {"type": "diffuse", "reflectance": _rgb(shape.material.albedo)}
     result: dict[str, Any] = {"bsdf": {"type": "twosided", "bsdf": diffuse}}
     if shape.emission is not None:
         if shape.emission.two_sided:
-            raise ValueError(f"{shape.name} emits on both sides, expected one side for Mitsuba")
+            raise NoCounterpart(f"{shape.name} emits on both sides, expected one side for Mitsuba")
         result["emitter"] = {"type": "area", "radiance": _rgb(shape.emission.radiance)}
     return result
 

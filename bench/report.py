@@ -18,7 +18,7 @@ from rich.table import Table
 from warpgi.device import Device
 
 CHECKOUT = Path(__file__).resolve().parent.parent
-PREFIXES = {"M": 1e6, "k": 1e3, "": 1.0}
+PREFIXES = {"M": 1e6, "k": 1e3}
 
 
 @dataclass(frozen=True)
@@ -60,19 +60,25 @@ def print_table(rows: Sequence[Row]) -> None:
         table.add_column(heading, justify="right" if heading in ("median", "lowest", "highest", "ratio") else "left")
     previous = None
     for item in rows:
-        prefix = next((p for p, scale in PREFIXES.items() if item.value >= scale), "") if item.unit[-1] != "s" else ""
-        if item.unit.endswith("/s"):
-            prefix = next((p for p, scale in PREFIXES.items() if item.value >= scale), "")
-        numbers = [f"{value / PREFIXES[prefix]:.4g}" for value in (item.value, item.low, item.high)]
+        scale, unit = scaled(item)
+        numbers = [f"{value / scale:.4g}" for value in (item.value, item.low, item.high)]
         ratio = "" if item.ratio is None else f"{item.ratio:.3f}"
         scene = "" if item.scene == previous else item.scene
-        unit = f"{prefix}{item.unit}" if item.unit == "B" else f"{prefix} {item.unit}".strip()
         table.add_row(scene, item.what, *numbers, unit, ratio, item.versus or "", item.note)
         previous = item.scene
     # a pipe has no width: lines are not to be broken there
     console = Console()
     console = console if console.is_terminal else Console(width=200)
     console.print(table)
+
+
+def scaled(item: Row) -> tuple[float, str]:
+    """What to divide a row's numbers by for reading, and the unit then."""
+    if item.unit not in ("", "s"):
+        for prefix, scale in PREFIXES.items():
+            if item.value >= scale:
+                return scale, f"{prefix}{item.unit}" if item.unit == "B" else f"{prefix} {item.unit}"
+    return 1.0, item.unit
 
 
 def circumstances(device: Device, versions: dict[str, str]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from warpgi.scenes.primitives import Mesh, disc, grid, icosphere, lathe
 CLEARANCE = 5e-4  # glass and metal float this far above the table [m], so that no two surfaces touch
 
 
-def caustic(lamp_radius: float = 0.12, roughness: float = 0.0, power: float = 120.0) -> Scene:
+def caustic(lamp_radius: float = 0.12, roughness: float = 0.0, power: float = 50.0) -> Scene:
     """A glass ball that focuses the lamp and a ring that draws the cardioid of its inside on the table.
 
     Args:

@@ -109,7 +109,7 @@ def _pots(parts: Parts, rng: np.random.Generator, detail: float) -> None:
     segments = max(8, round(32 * detail**0.5))
     near = EDGE - 0.45
     places = [(x, -near) for x in (-3.6, -1.2, 1.2, 3.6)] + [(-near, z) for z in (-3.4, -0.9, 3.4)]
-    places += [(near, z) for z in (-3.5, -1.3, 1.3, 3.7)] + [(-0.9, near), (1.6, near), (-4.95, -4.95), (4.95, -4.95)]
+    places += [(near, z) for z in (-3.5, -1.3, 1.3, 3.7)] + [(0.1, near), (2.2, near), (-4.95, -4.95), (4.95, -4.95)]
     for i, (x, z) in enumerate(places):
         radius, height = rng.uniform(0.2, 0.3), rng.uniform(0.32, 0.5)
         x, z = x + rng.normal(0.0, 0.1), z + rng.normal(0.0, 0.06)

@@ -102,10 +102,10 @@ def hare_distance(p: np.ndarray) -> np.ndarray:
     d = _blend(d, _ellipsoid(mirrored, (0.098, 0.80, 0.255), (0.027, 0.030, 0.027)), 0.006)  # eyes
     d = _blend(d, _ellipsoid(q, (0.0, 0.765, 0.375), (0.022, 0.016, 0.018)), 0.012)  # nose
     # The base: a round slab with rounded edges.
-    radial = np.hypot(p[:, 0], p[:, 2]) - 0.47
-    height = np.abs(p[:, 1] - 0.045) - 0.025
+    radial = np.hypot(p[:, 0], p[:, 2]) - 0.44
+    height = np.abs(p[:, 1] - 0.045) - 0.005
     slab = np.hypot(np.maximum(radial, 0.0), np.maximum(height, 0.0)) + np.minimum(np.maximum(radial, height), 0.0)
-    return _blend(d, slab - 0.02, 0.02)
+    return _blend(d, slab - 0.04, 0.02)
 
 
 def _ellipsoid(p: np.ndarray, centre: tuple, radii: tuple) -> np.ndarray:

@@ -217,6 +217,17 @@ def test_a_write_that_fails_leaves_the_old_file_alone(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_the_bytes_are_on_the_disk_before_the_name_changes(tmp_path, monkeypatch):
+    """The temporary is flushed before it takes the target's place, or a power cut could leave an empty file."""
+    calls = []
+    for name in ("fsync", "replace"):
+        call = getattr(os, name)
+        monkeypatch.setattr(os, name, lambda *args, name=name, call=call: (calls.append(name), call(*args)))
+    with atomic_write(tmp_path / "a.exr") as temporary:
+        temporary.write_text("new")
+    assert calls[:2] == ["fsync", "replace"]
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="needs resource limits")
 @pytest.mark.parametrize("pixels", [noise(200, 40), np.zeros((200, 40), np.float32)], ids=["noise", "black"])
 def test_a_full_disk_is_an_error(tmp_path, pixels):

@@ -415,6 +415,17 @@ def test_ply_colours_and_normals(tmp_path):
     np.testing.assert_array_equal(shape.normals, [(0, 0, 1)] * 4)
 
 
+def test_ply_with_texture_coordinates_keeps_its_normals(tmp_path):
+    """Texture coordinates per face corner, which split vertices in trimesh, leave normals where they are."""
+    header = PLY.format(extra="".join(f"property float n{c}\n" for c in "xyz")).replace("face 1", "face 2")
+    header = header.replace("end_header", "property list uchar float texcoord\nend_header")
+    rows = "".join(f"{x} {y} {z} {x} {y} 1\n" for x, y, z in SQUARE)
+    (tmp_path / "a.ply").write_text(header + rows + "3 0 1 2 6 0 0 1 0 1 1\n3 0 2 3 6 1 0 0 1 0 1\n")
+    (shape,) = load_scene(tmp_path / "a.ply").shapes
+    expected = np.add(shape.vertices, (0, 0, 1))
+    np.testing.assert_allclose(shape.normals, expected / np.linalg.norm(expected, axis=1)[:, None], **FLOAT32)
+
+
 def test_plain_ply_and_stl_are_grey_and_flat(tmp_path):
     """Without colours and normals in the file a shape is diffuse 0.8 and has none."""
     rows = "".join(f"{x} {y} {z}\n" for x, y, z in SQUARE)
@@ -448,6 +459,12 @@ def test_mtl_texture_outside_is_refused(tmp_path, reference):
     mtl = f"newmtl red paint\nmap_Kd {reference.format(absolute=tmp_path / 'secret.png')}\n"
     with pytest.raises(ValueError, match="outside the scene's folder"):
         load_scene(write_obj(folder, mtl))
+
+
+def test_unused_mtl_texture_outside_is_refused(tmp_path):
+    """Every map_Kd of a .mtl is checked before the first is opened, used or not."""
+    with pytest.raises(ValueError, match="outside the scene's folder"):
+        load_scene(write_obj(tmp_path, "newmtl red paint\nmap_Kd none.png\nnewmtl unused\nmap_Kd ../secret.png\n"))
 
 
 def test_mtllib_outside_is_refused(tmp_path):
@@ -486,7 +503,7 @@ def test_gltf_beside_its_buffer_and_texture(tmp_path):
     with pytest.raises(ValueError, match=r"texture 'a b.png' is missing"):
         load_scene(tmp_path / "a.gltf")
     (tmp_path / "a b.png").write_bytes(b"no picture")
-    with pytest.raises(ValueError, match=r"texture 'a%20b.png' is no picture"):
+    with pytest.raises(ValueError, match=r"texture 'a%20b.png' is none of PNG"):
         load_scene(tmp_path / "a.gltf")
     (tmp_path / "a b.png").write_bytes(png([[(255, 255, 255)]]))
     assert isinstance(load_scene(tmp_path / "a.gltf").shapes[0].material.albedo, Texture)
@@ -501,7 +518,7 @@ def test_missing_texture_of_mtl_is_an_error(tmp_path):
 def test_postscript_is_no_texture(tmp_path):
     """PIL would run a PostScript interpreter for an .eps, so no such texture is opened."""
     (tmp_path / "a.png").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\n")
-    with pytest.raises(ValueError, match="no picture"):
+    with pytest.raises(ValueError, match="is none of PNG"):
         load_scene(write_obj(tmp_path, "newmtl red paint\nmap_Kd a.png\n"))
 
 

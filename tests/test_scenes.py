@@ -221,7 +221,7 @@ def test_cornell_box_is_closed_but_for_its_front(scenes):
     through = (d[:, 2] < 0.0) & (front[:, :2] > -0.001).all(axis=1) & (front[:, :2] < [0.557, 0.55]).all(axis=1)
     found = hits(scenes["cornell-box"], np.tile(origin, (len(d), 1)), d)
     assert found[~through].all()
-    assert 20 < np.count_nonzero(~found)
+    assert np.count_nonzero(~found) > 20
 
 
 def test_cornell_lamp_faces_down_and_fills_its_hole(scenes):
@@ -376,7 +376,8 @@ def test_surface_nets_find_a_sphere():
     assert mesh.is_watertight
     assert mesh.volume == pytest.approx(4.0 / 3.0 * math.pi, rel=0.02)
     assert mesh.area == pytest.approx(4.0 * math.pi, rel=0.02)
-    assert np.allclose(net.normals, primitives.normalize(net.vertices), atol=0.01)
+    # A normal is off by less than the angle under which the centre sees a cell.
+    assert (net.normals * primitives.normalize(net.vertices)).sum(axis=1).min() > math.cos(0.1)
 
 
 def test_statuettes_at_default_have_10_to_40_thousand_triangles():
@@ -402,7 +403,7 @@ def test_caustic_lamp_faces_the_table_and_glass_faces_outwards(scenes):
     lamp, glass, ring = (shape_of(scene, name) for name in ("lamp", "glass ball", "ring"))
     centre, normal = face_normals(lamp)
     assert (primitives.normalize(-centre) * normal).sum(axis=1).min() > 0.99
-    assert math.pi * lamp.areas().sum() * lamp.emission.radiance[0] == pytest.approx(120.0, rel=0.01)
+    assert math.pi * lamp.areas().sum() * lamp.emission.radiance[0] == pytest.approx(50.0, rel=0.01)
     for shape in (glass, ring):
         mesh = welded(shape)
         assert mesh.is_watertight

@@ -2,7 +2,7 @@
 
 __version__ = "0.1.0"
 
-from warpgi import scenes
+from warpgi import scenes  # type: ignore[attr-defined]
 from warpgi.camera import Camera
 from warpgi.device import Device
 from warpgi.lights import DistantLight, Environment, PointLight, SpotLight

@@ -5,10 +5,10 @@ from __future__ import annotations
 import ast
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Union
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
@@ -21,7 +21,7 @@ MISUSE = 2  # exit status for a caller's mistake
 INTERRUPTED = 130
 
 # One subcommand a method; the table decides, so that a new method is here by being listed.
-METHOD_SETTINGS = tyro.extras.subcommand_type_from_defaults(
+METHOD_SETTINGS: Any = tyro.extras.subcommand_type_from_defaults(
     {name: kind() for name, kind in gi.METHODS.items()},
     {name: (kind.__doc__ or "").strip().splitlines()[0] for name, kind in gi.METHODS.items()},
 )
@@ -134,13 +134,13 @@ class InfoCommand:
         print(f"{'scene files':14s}{' '.join(SUFFIXES)}")
 
 
-COMMANDS = Union[
-    Annotated[RenderCommand, tyro.conf.subcommand("render")],
-    Annotated[CompareCommand, tyro.conf.subcommand("compare")],
-    Annotated[ScenesCommand, tyro.conf.subcommand("scenes")],
-    Annotated[MethodsCommand, tyro.conf.subcommand("methods")],
-    Annotated[InfoCommand, tyro.conf.subcommand("info")],
-]
+COMMANDS = (
+    Annotated[RenderCommand, tyro.conf.subcommand("render")]
+    | Annotated[CompareCommand, tyro.conf.subcommand("compare")]
+    | Annotated[ScenesCommand, tyro.conf.subcommand("scenes")]
+    | Annotated[MethodsCommand, tyro.conf.subcommand("methods")]
+    | Annotated[InfoCommand, tyro.conf.subcommand("info")]
+)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -193,7 +193,7 @@ def _layer(path: Path, name: str) -> np.ndarray:
     return picture.layers[name]
 
 
-def _table(items: dict[str, Callable[..., Any]]) -> None:
+def _table(items: Mapping[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
 

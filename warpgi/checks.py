@@ -20,7 +20,7 @@ def finite_array(name: str, value: Any, shape: tuple[int | None, ...], dtype: np
         array = np.asarray(value, dtype=dtype)
     except (TypeError, ValueError) as error:
         raise TypeError(f"{name} is {type(value).__name__}, expected numbers of shape {_shape(shape)}") from error
-    if array.ndim != len(shape) or any(want is not None and want != got for want, got in zip(shape, array.shape)):
+    if array.ndim != len(shape) or any(want not in (None, got) for want, got in zip(shape, array.shape, strict=True)):
         raise ValueError(f"{name} has shape {array.shape}, expected {_shape(shape)}")
     bad = np.count_nonzero(~np.isfinite(array))
     if bad:

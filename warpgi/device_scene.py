@@ -69,7 +69,9 @@ class DeviceScene:
         shapes = self.scene.shapes
         starts = np.cumsum([0] + [len(shape.vertices) for shape in shapes])
         points = np.concatenate([shape.vertices - self.centre for shape in shapes])
-        faces = np.concatenate([shape.faces + start for shape, start in zip(shapes, starts)]).astype(np.int32)
+        faces = np.concatenate([shape.faces + start for shape, start in zip(shapes, starts[:-1], strict=True)]).astype(
+            np.int32
+        )
         shape_of_face = np.repeat(np.arange(len(shapes), dtype=np.int32), [len(shape.faces) for shape in shapes])
         self.first_face = np.cumsum([0] + [len(shape.faces) for shape in shapes])
         a, b, c = (points[faces[:, i]] for i in range(3))
@@ -90,7 +92,9 @@ class DeviceScene:
 
     def _add_textures(self) -> None:
         self._textures: dict[int, int] = {}
-        records, texels, start = [], [], 0
+        records: list[kernels.TextureRecord] = []
+        texels: list[np.ndarray] = []
+        start = 0
         for shape in self.scene.shapes:
             texture = shape.texture
             if texture is None or id(texture) in self._textures:
@@ -111,7 +115,7 @@ class DeviceScene:
         powers: list[np.ndarray] = []
         environment = np.zeros(3)
         for i, shape in enumerate(self.scene.shapes):
-            if shape.emission is None or max(shape.emission.radiance) <= 0.0:
+            if shape.emission is None or np.max(shape.emission.radiance) <= 0.0:
                 continue
             density[i] = np.pi * float(np.mean(shape.emission.radiance)) * (2 if shape.emission.two_sided else 1)
             part = _light_records(len(shape.faces))
@@ -122,10 +126,10 @@ class DeviceScene:
             if isinstance(light, Environment):
                 environment = np.asarray(light.radiance)
                 continue
-            part, power = self._light_record(light)
-            if power > 0.0:
+            part, watts = self._light_record(light)
+            if watts > 0.0:
                 parts.append(part)
-                powers.append(np.array([power]))
+                powers.append(np.array([watts]))
         power = np.concatenate(powers) if powers else np.zeros(0)
         total = float(power.sum()) or 1.0
         struct = self.struct
@@ -200,7 +204,7 @@ def _per_vertex(parts: list[np.ndarray | None], starts: np.ndarray, width: int) 
     if all(part is None for part in parts):
         return np.zeros((0, width), np.float32)
     values = np.zeros((int(starts[-1]), width), np.float32)
-    for part, start in zip(parts, starts):
+    for part, start in zip(parts, starts[:-1], strict=True):
         if part is not None:
             values[start : start + len(part)] = part
     return values

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Union
 
 from warpgi import checks
 from warpgi.materials import RGB, Colour
@@ -76,4 +75,4 @@ class Environment:
         object.__setattr__(self, "radiance", checks.rgb("radiance", self.radiance))
 
 
-Light = Union[PointLight, SpotLight, DistantLight, Environment]
+Light = PointLight | SpotLight | DistantLight | Environment

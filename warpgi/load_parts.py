@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from warpgi.camera import Camera
 from warpgi.lights import Light
@@ -150,6 +150,8 @@ def image_pixels(data: bytes, name: str) -> np.ndarray:
             if image.mode.startswith("I"):
                 return np.repeat((np.asarray(image) >> 8).astype(np.uint8)[..., None], 3, axis=2)
             return np.asarray(image.convert("RGB"))
+    except UnidentifiedImageError as error:
+        raise SceneFileError(f"texture {name!r} is none of {', '.join(IMAGE_FORMATS)}") from error
     except Exception as error:
         raise SceneFileError(f"texture {name!r} is no picture that can be read: {error}") from error
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Union
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from warpgi import checks
 
 RGB = tuple[float, float, float]
 #: A colour as callers may write it: one number for grey, or three.
-Colour = Union[float, tuple[float, float, float]]
+Colour = float | RGB
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +111,7 @@ class Dielectric:
         checks.number("ior", self.ior, 1.0, 4.0)
 
 
-Material = Union[Diffuse, Conductor, Mirror, Dielectric]
+Material = Diffuse | Conductor | Mirror | Dielectric
 
 
 @dataclass(frozen=True)

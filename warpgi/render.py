@@ -153,7 +153,7 @@ def _check(scene: Scene, method: PathTracing, size: tuple[int, int]) -> None:
         raise TypeError(f"method is {type(method).__name__}, expected the settings of one: {names}")
     if not isinstance(size, (tuple, list)) or len(size) != 2:
         raise ValueError(f"size is {size!r}, expected (width, height)")
-    for name, value in zip(("width", "height"), size):
+    for name, value in zip(("width", "height"), size, strict=True):
         checks.count(name, value)
     if size[0] * size[1] >= 2**31:
         raise ValueError(f"size is {size[0]} x {size[1]}, expected fewer than 2^31 pixels")

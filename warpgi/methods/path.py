@@ -9,9 +9,9 @@ import warp as wp
 
 from warpgi import checks
 from warpgi.job import Job
-from warpgi.kernels import path as kernels
 from warpgi.kernels import rng
 from warpgi.kernels.film import Film
+from warpgi.kernels.path import PathSettings, trace_paths
 
 
 class Sampler(Enum):
@@ -59,18 +59,18 @@ class PathTracing:
     @property
     def kernels(self) -> tuple[wp.Kernel, ...]:
         """What it launches."""
-        return (kernels.trace_paths,)
+        return (trace_paths,)
 
-    def prepare(self, job: Job) -> kernels.PathSettings:
+    def prepare(self, job: Job) -> PathSettings:
         """The kernel's settings: path tracing builds nothing for a scene."""
-        settings = kernels.PathSettings()
+        settings = PathSettings()
         settings.max_depth = self.max_depth or NEVER
         settings.roulette_depth = self.roulette_depth or NEVER
         settings.sampler = int(rng.SOBOL if self.sampler is Sampler.SOBOL else rng.INDEPENDENT)
         settings.seed = job.seed
         return settings
 
-    def estimate(self, job: Job, state: kernels.PathSettings, film: Film, first_sample: int, sample_count: int) -> None:
+    def estimate(self, job: Job, state: PathSettings, film: Film, first_sample: int, sample_count: int) -> None:
         """Adds samples `first_sample` to `first_sample + sample_count - 1` of every pixel of the film's band."""
         inputs = [job.scene.struct, job.camera, state, first_sample, sample_count]
-        job.device.launch(kernels.trace_paths, film.count.size, inputs, [film])
+        job.device.launch(trace_paths, film.count.size, inputs, [film])
