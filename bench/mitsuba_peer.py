@@ -67,11 +67,13 @@ class MitsubaPeer:
 def export_scene(scene: Scene, size: tuple[int, int], max_depth: int, folder: Path) -> dict[str, Any]:
     """The dictionary that `mitsuba.load_dict` takes; triangles go through PLY files in `folder`.
 
+    A Mitsuba variant has to be set.
+
     Raises:
         NoCounterpart: the scene holds something else.
     """
     if scene.lights:
-        raise NoCounterpart(f"scene {scene.name} has lights beside its shapes, expected none for Mitsuba")
+        raise NoCounterpart(f"scene {scene.name} has lights beside its shapes")
     result = {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": max_depth, "rr_depth": NEVER},
@@ -88,7 +90,7 @@ def _sensor(camera: Camera, size: tuple[int, int]) -> dict[str, Any]:
     from mitsuba import ScalarTransform4f
 
     if camera.lens_radius > 0.0:
-        raise ValueError("camera has a lens, expected a pinhole for Mitsuba")
+        raise NoCounterpart("the camera has a lens")
     origin, target, up = (list(v) for v in (camera.position, camera.target, camera.up))
     return {
         "type": "perspective",
@@ -110,14 +112,14 @@ def _sensor(camera: Camera, size: tuple[int, int]) -> dict[str, Any]:
 
 def _surface(shape: Shape) -> dict[str, Any]:
     if not isinstance(shape.material, Diffuse) or isinstance(shape.material.albedo, Texture):
-        raise NoCounterpart(f"{shape.name} is not Diffuse of one colour, expected that for Mitsuba")
+        raise NoCounterpart(f"{shape.name} is not Diffuse of one colour")
     if shape.normals is not None:
-        raise NoCounterpart(f"{shape.name} has vertex normals, expected flat triangles for Mitsuba")
+        raise NoCounterpart(f"{shape.name} has vertex normals")
     diffuse = {"type": "diffuse", "reflectance": _rgb(shape.material.albedo)}
     result: dict[str, Any] = {"bsdf": {"type": "twosided", "bsdf": diffuse}}
     if shape.emission is not None:
         if shape.emission.two_sided:
-            raise NoCounterpart(f"{shape.name} emits on both sides, expected one side for Mitsuba")
+            raise NoCounterpart(f"{shape.name} emits on both sides")
         result["emitter"] = {"type": "area", "radiance": _rgb(shape.emission.radiance)}
     return result
 

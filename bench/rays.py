@@ -120,7 +120,7 @@ class Tracer:
         found = 0
         while found < self.count:
             rays = self._empty()
-            outputs = [rays.origins, rays.directions, rays.distances]
+            outputs = [rays.origins, rays.directions, self.device.zeros(self.count, float)]
             inputs = [self.struct, SEED + len(parts), self._faces()]
             self.device.launch(kernels.make_shadow_rays, self.count, inputs, outputs)
             arrays = [array.numpy().copy() for array in outputs]
@@ -147,7 +147,7 @@ class Tracer:
 
     def _empty(self) -> RaySet:
         origins, directions = (self.device.zeros(self.count, wp.vec3) for _ in range(2))
-        return RaySet(origins, directions, self.device.zeros(self.count, float))
+        return RaySet(origins, directions)
 
     def _faces(self) -> wp.array:
         # in float64: a triangle of a large scene is too small a part of a float32 sum
@@ -172,7 +172,7 @@ def run(settings: Settings, json: Path | None) -> None:
             peers[scene.name] = MitsubaPeer(scene, settings.size, MAX_DEPTH, device.threads)
             seen["mitsuba"] = peers[scene.name].version
         except NoCounterpart as error:
-            notes[scene.name] = f"not by Mitsuba: {error}"
+            notes[scene.name] = f"no Mitsuba: {error}"
     about = circumstances(device, seen)
     with atomic_write(json) if json else nullcontext() as file:
         rows = compile_rows(device.name)
@@ -328,6 +328,7 @@ def _path_tracing(settings: Settings) -> gi.PathTracing:
 
 def _settings_of_record(settings: Settings, device: gi.Device, peers: dict[str, MitsubaPeer]) -> dict[str, Any]:
     record = asdict(settings) | {"max_depth": MAX_DEPTH, "threads": device.threads, "device": device.name}
-    if peers:
-        record["peer_threads"] = {name: peer.threads for name, peer in peers.items()}
+    for peer in peers.values():
+        threads = {"threads": peer.drjit.thread_count(), "threads_set_by": "drjit.set_thread_count"}
+        record["mitsuba"] = {"variant": peer.mitsuba.variant(), "integrator": "path", **threads}
     return record

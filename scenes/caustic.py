@@ -28,14 +28,14 @@ def caustic(lamp_radius: float = 0.12, roughness: float = 0.0, power: float = 50
     metal = Conductor(roughness, gold) if roughness > 0.0 else Mirror(gold)
     # Phi = pi A L for a diffuse emitter.
     radiance = power / (np.pi * np.pi * lamp_radius**2)
-    lamp = _aim(disc(lamp_radius, 48), (1.6, 2.0, -0.9), (0.0, 0.0, 0.0))
+    lamp = _aim(disc(lamp_radius, 48), (1.7, 1.8, 0.9), (0.0, 0.0, 0.0))
     shapes = [
         _backdrop().shape(Diffuse((0.62, 0.60, 0.57)), "table"),
         icosphere(0.25, 5).move((-0.36, 0.25 + CLEARANCE, 0.16)).shape(Dielectric(1.5), "glass ball"),
         _ring(0.33, 0.02, 0.17).move((0.32, CLEARANCE, 0.0)).shape(metal, "ring"),
         lamp.shape(Diffuse(0.0), "lamp", Emissive((radiance, 0.93 * radiance, 0.82 * radiance))),
     ]
-    return Scene(shapes, Camera((-0.25, 1.25, 1.9), (-0.05, 0.08, 0.0), fov=36.0), name="caustic")
+    return Scene(shapes, Camera((0.1, 1.4, 1.8), (-0.03, 0.05, -0.03), fov=36.0), name="caustic")
 
 
 def _backdrop() -> Mesh:

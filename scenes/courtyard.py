@@ -28,7 +28,8 @@ FACETED = ("shutter", "pane", "iron", "paving", "terracotta")
 def courtyard(detail: float = 1.0, sun: float = 12.0, sky: float = 1.1) -> Scene:
     """A courtyard of 12 m with arcades on four sides, a tree, potted plants, creepers and tiled roofs.
 
-    The camera stands in the shade of the arcade. At detail 1 it has about 350 000 triangles, two thirds of them leaves.
+    The camera stands in the shade of the arcade. At detail 1 it has about 390 000 triangles, 160 000
+    of them leaves.
 
     Args:
         detail: scales the number of triangles, in [0.02, 20].

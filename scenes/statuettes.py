@@ -19,7 +19,7 @@ from warpgi.scenes.primitives import Mesh, merge, quad, vertex_normals
 ROUGHNESS = (0.01, 0.05, 0.25)  # of the statuettes, left to right (LALD12, footnote 2)
 GROUND_ROUGHNESS = 0.01
 COLOURS = ((0.93, 0.89, 0.83), (0.94, 0.68, 0.38), (0.93, 0.56, 0.45))  # silver, bronze, copper
-HEIGHT = 1.3  # of every statuette [m]
+HEIGHT, WIDTH = 1.3, 1.0  # what a statuette fits into [m]
 SUNK = 0.004  # how deep a statuette stands in the ground, so that no two surfaces lie in one plane [m]
 
 Figure = str | Path | tuple[Any, Any] | None
@@ -33,7 +33,7 @@ def statuettes(figure: Figure = None, resolution: int = 64, sky: float = 0.0) ->
 
     Args:
         figure: a mesh file, or its (vertices, faces), looking along +z with y up; None is a hare made in code. It
-            is scaled to one height and stood on the ground.
+            is scaled to fit 1.3 m of height and 1 m of width, and stood on the ground.
         resolution: of the hare, cells over its height, 16 to 256; about 4 resolution^2 triangles each.
         sky: radiance from all around, W/(sr m^2); the paper has none.
     """
@@ -41,7 +41,7 @@ def statuettes(figure: Figure = None, resolution: int = 64, sky: float = 0.0) ->
     mesh = hare(checks.count("resolution", resolution, 16, 256)) if figure is None else _given(figure)
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     foot = [0.5 * (low[0] + high[0]), low[1], 0.5 * (low[2] + high[2])]
-    mesh = mesh._replace(vertices=(mesh.vertices - foot) * (HEIGHT / (high[1] - low[1])))
+    mesh = mesh._replace(vertices=(mesh.vertices - foot) * min(HEIGHT / (high[1] - low[1]), WIDTH / (high[0] - low[0])))
 
     ground = quad((-25, 0, 25), (50, 0, 0), (0, 0, -50))
     shapes = [ground.shape(Conductor(GROUND_ROUGHNESS, (0.62, 0.64, 0.68)), "ground")]

@@ -32,8 +32,9 @@ def bench(monkeypatch):
 def test_rays_prints_a_table_and_writes_json(tmp_path):
     """One command measures every kind of ray, and says with what."""
     out = tmp_path / "out.json"
-    command = "bench rays --device cpu --scenes cornell-box --size 32 32 --repeats 1 --json".split()
-    done = subprocess.run([sys.executable, "-m", *command, out], cwd=CHECKOUT, capture_output=True, text=True)
+    arguments = ["--device", "cpu", "--scenes", "cornell-box", "--size", "32", "32", "--repeats", "1", "--json", out]
+    command = [sys.executable, "-m", "bench", "rays", *arguments]
+    done = subprocess.run(command, cwd=CHECKOUT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     content = json.loads(out.read_text())
     rows = {row["what"]: row for row in content["rows"]}
@@ -75,7 +76,7 @@ def test_a_mistake_is_one_sentence(bench, capsys, arguments, words):
 def test_a_missing_peer_is_one_sentence(bench, capsys, monkeypatch):
     """Without Mitsuba the bench says how to get it."""
     monkeypatch.setitem(sys.modules, "mitsuba", None)
-    assert bench.__main__.main("rays --device cpu --scenes cornell-box --peers".split()) == 2
+    assert bench.__main__.main(["rays", "--device", "cpu", "--scenes", "cornell-box", "--peers"]) == 2
     assert "pip install warpgi[peers]" in capsys.readouterr().err
 
 

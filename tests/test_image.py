@@ -51,7 +51,8 @@ def test_attributes_come_back_as_text(tmp_path):
     attributes = {"warpgi:a": "", "warpgi:b": "x" * 9000, "warpgi:c": "Küche 漢字", "warpgi:d": "\udcff.glb"}
     write_exr(tmp_path / "a.exr", {"R": noise()}, attributes)
     _, found = read_exr(tmp_path / "a.exr")
-    assert found == attributes | {"warpgi:d": "\\udcff.glb"}
+    own = {name: text for name, text in found.items() if name in attributes}  # OpenEXR 3.3 adds a part name
+    assert own == attributes | {"warpgi:d": "\\udcff.glb"}
 
 
 def test_half_floats_and_data_windows_are_read(tmp_path):

@@ -44,8 +44,8 @@ def face_normals(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
     return (a + b + c) / 3.0, n / np.linalg.norm(n, axis=1, keepdims=True)
 
 
-def hits(scene: Scene, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Whether rays meet any triangle of the scene, by Moeller and Trumbore, in float64."""
+def hits(scene: Scene, origins: np.ndarray, directions: np.ndarray, reach: float = math.inf) -> np.ndarray:
+    """Whether rays meet any triangle of the scene within `reach`, by Moeller and Trumbore, in float64."""
     corner = np.concatenate([shape.vertices[shape.faces] for shape in scene.shapes])
     edge1, edge2 = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
     found = []
@@ -58,7 +58,7 @@ def hits(scene: Scene, origins: np.ndarray, directions: np.ndarray) -> np.ndarra
             q = np.cross(s, edge1)
             v = (q @ d) / det
             t = (edge2 * q).sum(axis=1) / det
-            found.append(bool(((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 1e-9)).any()))
+            found.append(bool(((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 1e-9) & (t < reach)).any()))
     return np.array(found)
 
 
@@ -70,6 +70,7 @@ def project(scene: Scene, points: np.ndarray) -> np.ndarray:
     """Picture coordinates of points for a square picture: right and up, each in [-1, 1] inside."""
     right, up, forward = scene.camera.frame()
     d = points - np.asarray(scene.camera.position)
+    assert (d @ forward > 0.0).all(), "a point lies behind the camera"
     size = np.tan(np.radians(scene.camera.fov) / 2.0) * (d @ forward)
     return np.stack([d @ right / size, d @ up / size], axis=1)
 
@@ -136,6 +137,16 @@ def test_parameters_have_defaults_and_a_docstring():
         for parameter in inspect.signature(function).parameters.values():
             assert parameter.default is not inspect.Parameter.empty
             assert f"{parameter.name}:" in function.__doc__ or f"{parameter.name}, " in function.__doc__, name
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_camera_looks_at_the_scene(scenes, name):
+    """Of 25 rays over a square picture at least three in five meet the scene."""
+    camera = scenes[name].camera
+    across = np.tan(np.radians(camera.fov) / 2.0) * np.linspace(-0.9, 0.9, 5)
+    x, y = (a.ravel() for a in np.meshgrid(across, across))
+    d = primitives.normalize(np.stack([x, y, np.ones(25)], axis=1) @ camera.frame())
+    assert hits(scenes[name], np.tile(camera.position, (25, 1)), d).mean() >= 0.6
 
 
 # --- build -------------------------------------------------------------------------------------------------------
@@ -386,11 +397,11 @@ def test_statuettes_at_default_have_10_to_40_thousand_triangles():
 
 
 def test_statuettes_take_a_mesh():
-    """A given figure is scaled to 1.3 m and stood on the ground, with normals outwards."""
+    """A given figure is scaled to fit, here to 1 m of width, and stood on the ground, with normals outwards."""
     ball = trimesh.creation.icosphere(subdivisions=2, radius=7.0)
     scene = warpgi.scenes.statuettes(figure=(ball.vertices + 30.0, ball.faces))
     for shape in scene.shapes[1:]:
-        assert np.ptp(shape.vertices[:, 1]) == pytest.approx(1.3)
+        assert np.ptp(shape.vertices[:, 1]) == pytest.approx(1.0, rel=0.02)
         assert -0.01 < shape.vertices[:, 1].min() < 0.0
         assert len(shape.faces) == 320
         outward = shape.vertices - shape.vertices.mean(axis=0)
@@ -418,8 +429,7 @@ def test_courtyard_is_rich_and_scales():
     assert full.degenerate_count == 0
     assert full.triangle_count >= 300_000
     assert low.triangle_count < 0.2 * full.triangle_count
-    leaves = sum(len(s.faces) // 2 for s in full.shapes if s.name in ("leaf", "potted", "blossom"))
-    assert leaves > 20_000
+    assert sum(len(shape.faces) // 2 for shape in full.shapes if shape.name in ("leaf", "blossom")) > 50_000
 
 
 def test_courtyard_camera_stands_in_the_shade(scenes):
@@ -431,6 +441,22 @@ def test_courtyard_camera_stands_in_the_shade(scenes):
     floor = np.stack([rng.uniform(-5.5, 5.5, 60), np.full(60, 1e-3), rng.uniform(-5.5, 5.5, 60)], axis=1)
     shaded = hits(scene, floor, np.tile(sun, (60, 1))).mean()
     assert 0.3 < shaded < 0.97
+
+
+def test_courtyard_walls_have_no_holes(scenes):
+    """A step in front of the upper wall something is hit on all four sides, and the sun reaches the far side."""
+    scene = scenes["courtyard"]
+    x = np.linspace(-5.9, 5.9, 24)
+    y = np.tile([4.3, 5.5, 6.7], 8)
+    for quarter in range(4):
+        c, s = round(math.cos(0.5 * math.pi * quarter)), round(math.sin(0.5 * math.pi * quarter))
+        turn = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+        origins = np.stack([x, y, np.full(24, -5.6)], axis=1) @ turn.T
+        assert hits(scene, origins, np.tile(turn @ [0.0, 0.0, -1.0], (24, 1)), reach=1.0).all(), quarter
+    sun = -np.array(next(light.direction for light in scene.lights if isinstance(light, DistantLight)))
+    assert sun[2] > 0.0, "the far wall faces away from the sun"
+    far = np.stack([x, np.full(24, 5.0), np.full(24, -5.8)], axis=1)
+    assert hits(scene, far, np.tile(sun, (24, 1))).mean() < 0.7
 
 
 def test_courtyard_is_textured(scenes):
@@ -462,6 +488,12 @@ def test_solids_are_closed_and_have_their_volume(mesh, volume, tolerance):
     assert closed.is_watertight
     assert closed.is_winding_consistent
     assert closed.volume == pytest.approx(volume, rel=tolerance)
+
+
+def test_revolution_closes_to_the_last_bit():
+    """The seam's two copies of a vertex are equal, so no ray slips between them."""
+    v = primitives.revolution([(0.3, 0.0), (0.7, 1.0)], 7).vertices.reshape(2, 8, 3)
+    assert np.array_equal(v[:, 0], v[:, -1])
 
 
 def test_primitives_face_where_they_say():

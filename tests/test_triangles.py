@@ -183,7 +183,7 @@ def test_walk_agrees_with_brute_force(count):
     o = np.concatenate([inside, outside, 5.0 * away])
     # directions of any length, and rays that leave everything behind
     d = np.concatenate([directions(n, rng), aim, away])
-    assert compare(rays, o, d) > (n // 4 if count > 2 else 10)
+    assert compare(rays, o, d) > (n // 8 if count > 2 else 10)
     assert (rays.trace(5.0 * away, away)[0] == -1).all()
 
 
@@ -193,7 +193,7 @@ def test_scale_does_not_matter(scale):
     points, faces = soup(300)
     rays = Rays(points * np.float32(scale), faces)
     rng = np.random.default_rng(8)
-    assert compare(rays, rng.uniform(-1, 1, (400, 3)) * scale, directions(400, rng)) > 200
+    assert compare(rays, rng.uniform(-1, 1, (400, 3)) * scale, directions(400, rng)) > 100
 
 
 @pytest.mark.parametrize("shift", [(100.0, -30.0, 0.0), (0.0, 1000.0, 5000.0)])
@@ -203,7 +203,7 @@ def test_distance_from_the_origin_does_not_matter(shift):
     rays = Rays(points + np.float32(shift), faces)
     rng = np.random.default_rng(9)
     o = rng.uniform(-1, 1, (400, 3)) + shift
-    assert compare(rays, o, directions(400, rng)) > 200
+    assert compare(rays, o, directions(400, rng)) > 100
 
 
 def test_axis_parallel_rays():

@@ -199,7 +199,7 @@ class Render:
     def _attributes(self) -> dict[str, str]:
         values = {name: str(getattr(self, name)) for name in ("method", "scene", "device", "seed", "spp")}
         values |= {name: json.dumps(getattr(self, name)) for name in ("settings", "timings", "counts", "versions")}
-        values["seconds"] = f"{sum(self.timings.values()):.6g}"  # for people; `load` adds the timings up again
+        values["seconds"] = f"{sum(self.timings.values()):.6g}"  # for people; `load` reads the timings
         return {PREFIX + name: text for name, text in values.items()}
 
     @classmethod
