@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from warpgi.scenes.primitives import Mesh, box, grid, lathe, merge, prism, quad, quads, revolution, scatter, tubes
+from warpgi.scenes.primitives import Mesh, box, grid, merge, prism, quad, quads, revolution, scatter, tubes
 from warpgi.scenes.textures import texel
 
 HALF = 6.0  # half the court's width, to the wall's face [m]
@@ -222,17 +222,3 @@ def _sloped(mesh: Mesh) -> Mesh:
     v[:, 1] += TOP + 0.1 + SLOPE * (-v[:, 2] - EAVES)
     n[:, 2] += SLOPE * n[:, 1]  # a shear moves normals by its inverse transpose
     return mesh._replace(vertices=v, normals=n / np.linalg.norm(n, axis=1, keepdims=True))
-
-
-def lathe_pot(radius: float, height: float, segments: int) -> Mesh:
-    """A flower pot with a rim and soil in it, on y = 0."""
-    r, h = radius, height
-    outside = [
-        (0.68 * r, 0.0),
-        (0.92 * r, 0.82 * h),
-        (1.05 * r, 0.84 * h),
-        (1.08 * r, h),
-        (0.95 * r, h),
-        (0.9 * r, 0.9 * h),
-    ]
-    return lathe(outside, segments)

@@ -12,7 +12,7 @@ from warpgi.lights import DistantLight, Environment
 from warpgi.materials import Conductor, Diffuse, Material
 from warpgi.scene import Scene
 from warpgi.scenes import plants, textures
-from warpgi.scenes.architecture import EDGE, HALF, STEP, Parts, lathe_pot, north_side
+from warpgi.scenes.architecture import EDGE, HALF, STEP, Parts, north_side
 from warpgi.scenes.primitives import Mesh, box, disc, lathe, merge, quad, revolution, scatter
 
 SEED = 1612
@@ -114,7 +114,7 @@ def _pots(parts: Parts, rng: np.random.Generator, detail: float) -> None:
     for i, (x, z) in enumerate(places):
         radius, height = rng.uniform(0.2, 0.3), rng.uniform(0.32, 0.5)
         x, z = x + rng.normal(0.0, 0.1), z + rng.normal(0.0, 0.06)
-        parts["clay"].append(lathe_pot(radius, height, segments).move((x, 0.0, z)))
+        parts["clay"].append(_pot(radius, height, segments).move((x, 0.0, z)))
         parts["soil"].append(disc(0.9 * radius, segments).move((x, 0.9 * height, z)))
         stems, leaves = plants.potted(rng, detail, rng.uniform(0.5, 1.1), rng.uniform(0.2, 0.45))
         place = (x, 0.9 * height, z)
@@ -141,7 +141,7 @@ def _table(parts: Parts, place: tuple[float, float, float], angle: float, segmen
     parts["wood"].append(merge([leg, top]).move(place))
     cloth = lathe([(0.40, 0.752), (0.40, 0.757), (0.0, 0.757)], segments)
     parts["linen"].append(cloth.move(place))
-    parts["clay"].append(lathe_pot(0.07, 0.14, segments).move(np.add(place, (0.1, 0.757, 0.05))))
+    parts["clay"].append(_pot(0.07, 0.14, segments).move(np.add(place, (0.1, 0.757, 0.05))))
     for k in range(3):
         turn = angle + 2.0 * np.pi * k / 3.0
         chair = _chair().move((0.0, 0.0, 0.78)).turn(turn).move(place)
@@ -157,3 +157,17 @@ def _chair() -> Mesh:
     rail = box((-0.21, 0.88, 0.165), (0.21, 0.95, 0.21))
     posts = scatter(box((-0.02, 0.49, 0.165), (0.02, 0.89, 0.205)), np.array([(-0.19, 0.0, 0.0), (0.19, 0.0, 0.0)]))
     return merge([legs, box((-0.22, 0.45, -0.22), (0.22, 0.49, 0.22)), slats, rail, posts])
+
+
+def _pot(radius: float, height: float, segments: int) -> Mesh:
+    """A flower pot with a rim, open above, on y = 0."""
+    r, h = radius, height
+    outside = [
+        (0.68 * r, 0.0),
+        (0.92 * r, 0.82 * h),
+        (1.05 * r, 0.84 * h),
+        (1.08 * r, h),
+        (0.95 * r, h),
+        (0.9 * r, 0.9 * h),
+    ]
+    return lathe(outside, segments)

@@ -140,7 +140,6 @@ def test_blinn_half_vector(chi_square, exponent):
 
 
 @pytest.mark.parametrize("exponent", [1e4, 1e5])
-@pytest.mark.parametrize("exponent", [1e4, 1e5])
 def test_sharp_blinn_half_vector_has_no_rings(chi_square, exponent):
     """At the smallest roughness that Conductor allows, sin theta of the half vector still follows the pdf.
 
