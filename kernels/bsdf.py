@@ -72,10 +72,10 @@ def conductor_reflectance(shape: ShapeRecord, albedo: wp.vec3, cos_i: float):
 @wp.func
 def fresnel_dielectric(cos_i: float, eta: float):
     """Unpolarised reflectance at an interface whose far side has `eta` times the near side's index."""
-    sin_t2 = (1.0 - cos_i * cos_i) / (eta * eta)
-    if sin_t2 >= 1.0:
+    cos_t2 = (eta * eta - 1.0 + cos_i * cos_i) / (eta * eta)  # 1 - sin^2 by Snell, without cancellation
+    if cos_t2 <= 0.0:
         return 1.0  # total internal reflection
-    cos_t = wp.sqrt(1.0 - sin_t2)
+    cos_t = wp.sqrt(cos_t2)
     rp = (eta * cos_i - cos_t) / (eta * cos_i + cos_t)
     rs = (cos_i - eta * cos_t) / (cos_i + eta * cos_t)
     return 0.5 * (rs * rs + rp * rp)
@@ -130,7 +130,7 @@ def refract_or_reflect(shape: ShapeRecord, n: wp.vec3, wo: wp.vec3, choice: floa
     if choice < r:
         s.wi = m * (2.0 * cos_o) - wo
     else:
-        cos_t = wp.sqrt(wp.max(0.0, 1.0 - (1.0 - cos_o * cos_o) / (eta * eta)))
+        cos_t = wp.sqrt(wp.max(0.0, (eta * eta - 1.0 + cos_o * cos_o) / (eta * eta)))
         s.wi = m * (cos_o / eta - cos_t) - wo / eta
         s.transmitted = 1
         s.eta = eta

@@ -54,9 +54,12 @@ def reflects(s: Surface, wo: wp.vec3, wi: wp.vec3):
 
 @wp.func
 def direct_light(
-    scene: Scene, shape: ShapeRecord, s: Surface, n: wp.vec3, wo: wp.vec3, u: wp.vec2, choice: float, weigh: int
+    scene: Scene, shape: ShapeRecord, s: Surface, n: wp.vec3, wo: wp.vec3, u: wp.vec2, choice: float, share: float
 ):
-    """Light of one sampled light, reflected at s; with `weigh` 1 it shares its part with BSDF sampling."""
+    """Light of one sampled light, reflected at s.
+
+    `share` is the number of BSDF samples for each light sample that look for the same light, 0 if none does.
+    """
     result = DirectLight()
     result.radiance = wp.vec3(0.0)
     light = sample_light(scene, s.p, u, choice)
@@ -76,8 +79,8 @@ def direct_light(
     result.shadow_rays = 1
     if not occluded(scene, o, d, distance * SHADOW_SHORTER):
         w = float(1.0)
-        if weigh != 0 and light.pdf > 0.0:
-            w = power_heuristic(light.pdf, pdf(shape, n, wo, light.wi))
+        if share > 0.0 and light.pdf > 0.0:
+            w = power_heuristic(light.pdf, share * pdf(shape, n, wo, light.wi))
         result.radiance = wp.cw_mul(f, light.weight) * w
     return result
 

@@ -48,13 +48,26 @@ def add_light(path: PathSample, depth: int, radiance: wp.vec3):
 
 
 @wp.func
-def trace_path(scene: Scene, settings: PathSettings, sampler: Sampler, origin: wp.vec3, direction: wp.vec3):
+def trace_path(
+    scene: Scene,
+    settings: PathSettings,
+    sampler: Sampler,
+    first_pair: int,
+    origin: wp.vec3,
+    direction: wp.vec3,
+    first_pdf: float,
+):
+    """Light that arrives at `origin` against `direction`, by the number of its scatterings.
+
+    `first_pdf` is the density of the direction where light sampling at `origin` shares its emission, else 0. The path
+    takes its random numbers from pair `first_pair` on.
+    """
     path = PathSample()
     path.depth = -1.0
     o = origin
     d = direction
     throughput = wp.vec3(1.0)
-    bsdf_pdf = float(0.0)  # of the direction d; 0: from the camera or a delta lobe
+    bsdf_pdf = first_pdf  # of the direction d; 0: from the camera or a delta lobe
     eta_scale = float(1.0)  # product of crossed indices squared, which roulette must not mistake for loss
     depth = int(1)
     while True:
@@ -83,10 +96,10 @@ def trace_path(scene: Scene, settings: PathSettings, sampler: Sampler, origin: w
         n = s.n
         if shape.kind != DIELECTRIC:
             n = facing_normal(s, wo)
-        pair = CAMERA_PAIRS + VERTEX_PAIRS * (depth - 1)
+        pair = first_pair + VERTEX_PAIRS * (depth - 1)
         extra = sample_2d(sampler, pair + 2)
         if scene.light_count > 0 and not is_delta(shape.kind):
-            light = direct_light(scene, shape, s, n, wo, sample_2d(sampler, pair), extra[0], 1)
+            light = direct_light(scene, shape, s, n, wo, sample_2d(sampler, pair), extra[0], 1.0)
             path.shadow_rays = path.shadow_rays + light.shadow_rays
             path = add_light(path, depth + 1, wp.cw_mul(throughput, light.radiance))
         if last and scene.visible_light == 0:
@@ -136,4 +149,4 @@ def trace_paths(
         if camera.lens_radius > 0.0:
             lens = sample_2d(sampler, 1)
         ray = camera_ray(camera, x + u[0], y + u[1], lens)
-        add_sample(film, i, trace_path(scene, settings, sampler, ray.o, ray.d))
+        add_sample(film, i, trace_path(scene, settings, sampler, CAMERA_PAIRS, ray.o, ray.d, 0.0))

@@ -66,8 +66,9 @@ def square_to_triangle(u: wp.vec2):
 @wp.func
 def square_to_blinn_half_vector(u: wp.vec2, exponent: float):
     """Half vector around +z with pdf (e+1)/(2 pi) cos^e (Pharr, Humphreys 2010, sec. 14.5)."""
-    cos_h = wp.pow(1.0 - u[0], 1.0 / (exponent + 1.0))
-    sin_h = wp.sqrt(wp.max(0.0, 1.0 - cos_h * cos_h))
+    log_cos = wp.log(1.0 - u[0]) / (exponent + 1.0)
+    cos_h = wp.exp(log_cos)
+    sin_h = wp.sqrt(wp.max(0.0, -2.0 * cos_h * wp.sinh(log_cos)))  # 1 - cos^2 without cancellation
     phi = 2.0 * PI * u[1]
     return wp.vec3(sin_h * wp.cos(phi), sin_h * wp.sin(phi), cos_h)
 

@@ -7,6 +7,8 @@ that no ray slips through the edge between two triangles.
 
 import warp as wp
 
+from warpgi.kernels.lanes import LANES_HEAD
+
 wp.set_module_options({"enable_backward": False})
 
 WIDTH = 8
@@ -28,7 +30,9 @@ class TriangleTree:
 
 # Returns (t, u, v, bits of the face's number); the face is -1 where nothing is hit. With `any_hit` the first hit found
 # ends the walk, and t, u, v are not of the nearest.
-WALK = """
+WALK = (
+    LANES_HEAD
+    + """
     const int KX[3] = {1, 2, 0}, KY[3] = {2, 0, 1};
     const float ad0 = wp::abs(d[0]), ad1 = wp::abs(d[1]), ad2 = wp::abs(d[2]);
     const int kz = ad0 > ad1 ? (ad0 > ad2 ? 0 : 2) : (ad1 > ad2 ? 1 : 2);
@@ -66,17 +70,17 @@ WALK = """
                 met[k] = enter <= leave ? 1 : 0;
             }
             const int base = top;
-            for (int k = 0; k < 8; ++k) {
-                if (met[k]) {
-                    int slot = top++;
-                    while (slot > base && entry[slot - 1] < near[k]) {
-                        entry[slot] = entry[slot - 1];
-                        stack[slot] = stack[slot - 1];
-                        --slot;
-                    }
-                    entry[slot] = near[k];
-                    stack[slot] = kids[k];
+            unsigned mask = lane_mask(met);
+            while (mask) {
+                const int k = next_lane(mask);
+                int slot = top++;
+                while (slot > base && entry[slot - 1] < near[k]) {
+                    entry[slot] = entry[slot - 1];
+                    stack[slot] = stack[slot - 1];
+                    --slot;
                 }
+                entry[slot] = near[k];
+                stack[slot] = kids[k];
             }
         } else {
             const int block = -1 - current;
@@ -102,8 +106,10 @@ WALK = """
                 v[k] = w1 * inv;
                 met[k] = (int)(((low >= 0.0f) | (high <= 0.0f)) & (det != 0.0f) & (t[k] > 0.0f) & (t[k] < best));
             }
-            for (int k = 0; k < 8; ++k) {
-                if (met[k] && t[k] < best) {
+            unsigned mask = lane_mask(met);
+            while (mask) {
+                const int k = next_lane(mask);
+                if (t[k] < best) {
                     best = t[k];
                     best_u = u[k];
                     best_v = v[k];
@@ -125,6 +131,7 @@ done:
     memcpy(&bits, &best_face, 4);
     return wp::vec4(best, best_u, best_v, bits);
 """
+)
 
 
 @wp.func_native(WALK)

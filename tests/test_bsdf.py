@@ -147,7 +147,7 @@ def case(name: str) -> ShapeRecord:
 @pytest.mark.parametrize("degrees", ANGLES)
 @pytest.mark.parametrize("name", ["diffuse", *map(str, CONDUCTORS)])
 def test_sample_follows_pdf(chi_square, name, degrees):
-    """Directions fall into cells of the hemisphere as pdf says, and what falls below the horizon is what pdf leaves out.
+    """Directions fall into cells of the hemisphere as pdf says; what falls below the horizon is what pdf leaves out.
 
     Cells come from pilot samples, so that narrow lobes are resolved; the last cell is "absorbed". The pdf is smooth
     over a cell, and the horizon is a cell's border.
@@ -273,7 +273,7 @@ def test_conductor_matches_the_formula():
         g = np.minimum(1.0, np.minimum(2 * cos_h * cos_o / oh, 2 * cos_h * cos_i / oh))
         f = 0.7 + 0.3 * (1.0 - oh[:, None]) ** 5 * np.ones(3)
         if measured:
-            f = np.stack([exact_fresnel(oh, complex(a, b)) for a, b in zip(ETA, K)], axis=1)
+            f = np.stack([exact_fresnel(oh, complex(a, b)) for a, b in zip(ETA, K, strict=True)], axis=1)
         expected = f * ((e + 2.0) / (2.0 * np.pi) * cos_h**e * g / (4.0 * cos_o))[:, None]
         value, pdf = evaluate(shape, wo, wi, N, albedo=0.7)
         density = (e + 1.0) * cos_h**e / (8.0 * np.pi * oh)
@@ -323,14 +323,14 @@ def test_fresnel_of_a_conductor():
     assert reflectances(1.0, eta, k)[:, 0] == pytest.approx(at_normal, abs=16 * ULP)
     assert reflectances(0.0, eta, k)[:, 0] == pytest.approx(1.0, abs=8 * ULP)
     cos = np.linspace(0.0, 1.0, 1001, dtype=np.float32).astype(np.float64)
-    for a, b in zip(eta, k):
+    for a, b in zip(eta, k, strict=True):
         r = reflectances(cos, a, b)[:, 0]
         assert np.abs(r - exact_fresnel(cos, complex(a, b))).max() < 64 * ULP
         assert r.max() <= 1.0 + 4 * ULP
 
 
 def test_fresnel_of_a_dielectric():
-    """((n-1)/(n+1))^2 at normal incidence, 1 at grazing, half of rs^2 at Brewster's angle, 1 beyond the critical angle."""
+    """((n-1)/(n+1))^2 at normal incidence, 1 at grazing and beyond the critical angle, 0.5 rs^2 at Brewster's."""
     for n in (1.33, 1.5, 2.4):
         assert reflectances(1.0, n, 0.0)[0, 1] == pytest.approx(((n - 1) / (n + 1)) ** 2, abs=8 * ULP)
         assert reflectances(0.0, n, 0.0)[0, 1] == pytest.approx(1.0, abs=8 * ULP)
@@ -363,7 +363,7 @@ def test_schlick_stays_near():
         assert value[0] == pytest.approx(1.0, abs=2 * ULP)
         assert value[-1] == pytest.approx(r, abs=2 * ULP)
         assert (np.diff(value) <= 2 * ULP).all()
-    for eta, k in zip(ETA, K):
+    for eta, k in zip(ETA, K, strict=True):
         r = exact_fresnel(np.array([1.0]), complex(eta, k))[0]
         assert np.abs(reflectances(cos, 1.0, r)[:, 2] - exact_fresnel(cos, complex(eta, k))).max() < 0.05
 

@@ -70,9 +70,7 @@ def test_field_of_view_and_aspect(fov):
 
 def test_y_points_down_and_x_right():
     """From +z the film's x grows with the world's x and its y falls with the world's y; an unlevel `up` is levelled."""
-    _, d = rays(
-        Camera(position=(0, 0, 10), target=(0, 0, 0), up=(0.0, 1.0, 0.7)), [[0, 0], [WIDTH, 0], [0, HEIGHT]]
-    )
+    _, d = rays(Camera(position=(0, 0, 10), target=(0, 0, 0), up=(0.0, 1.0, 0.7)), [[0, 0], [WIDTH, 0], [0, HEIGHT]])
     assert d[0][0] < 0.0 < d[0][1]
     assert d[1][0] > 0.0 < d[1][1]
     assert d[2][0] < 0.0 > d[2][1]
@@ -95,7 +93,7 @@ def test_film_positions_lie_on_a_plane():
 
 @pytest.mark.parametrize("focus", [None, 3.0])
 def test_thin_lens_is_sharp_at_the_focus_distance(focus):
-    """All rays of a film point meet where the pinhole's ray crosses the plane at the focus distance; None: the target's.
+    """Rays of a film point meet where the pinhole's ray crosses the plane at the focus distance; None: the target's.
 
     Distances count along the viewing direction, so the plane is flat.
     """

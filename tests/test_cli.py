@@ -54,7 +54,9 @@ def test_a_mesh_file_of_ones_own(tmp_path, capsys):
     """A file is a scene too, by its suffix."""
     mesh = tmp_path / "tetra.obj"
     mesh.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n")
-    status, text, _ = run("render", mesh, "path", "--spp", 2, "--size", 8, 8, "--out", tmp_path / "t.png", capsys=capsys)
+    status, text, _ = run(
+        "render", mesh, "path", "--spp", 2, "--size", 8, 8, "--out", tmp_path / "t.png", capsys=capsys
+    )
     assert status == 0
     assert "tetra, path" in text
 
@@ -146,7 +148,19 @@ def test_bar_and_ctrl_c(tmp_path):
     import pty
 
     out = tmp_path / "a.exr"
-    command = [sys.executable, "-m", "warpgi", "render", "cornell-box", "path", "--spp", "10000000", "--size", "32", "32"]
+    command = [
+        sys.executable,
+        "-m",
+        "warpgi",
+        "render",
+        "cornell-box",
+        "path",
+        "--spp",
+        "10000000",
+        "--size",
+        "32",
+        "32",
+    ]
     terminal, side = pty.openpty()
     process = subprocess.Popen(
         [*command, "--device", "cpu", "--out", str(out)], stdout=subprocess.PIPE, stderr=side, text=True, cwd=tmp_path

@@ -98,11 +98,11 @@ def unit(v) -> np.ndarray:
 
 
 def polygon_irradiance(corners: np.ndarray, p: Sequence[float], n: np.ndarray) -> float:
-    """Irradiance from a polygon of radiance 1 wholly above the horizon (Lambert 1760): 1/2 sum of angle times cosine."""
+    """Irradiance from a polygon of radiance 1 above the horizon (Lambert 1760): 1/2 sum of angle times cosine."""
     v = corners - np.asarray(p)
     v /= np.linalg.norm(v, axis=1, keepdims=True)
     total = 0.0
-    for a, b in zip(v, np.roll(v, -1, axis=0)):
+    for a, b in zip(v, np.roll(v, -1, axis=0), strict=True):
         cross = np.cross(a, b)
         angle = np.arctan2(np.linalg.norm(cross), a @ b)
         total += 0.5 * angle * (cross @ n) / np.linalg.norm(cross)
@@ -159,7 +159,7 @@ def test_lights_are_picked_by_their_power(chi_square):
 
 
 def test_every_choice_picks_a_light():
-    """The smallest and the largest number below 1 pick the first and the last light that have power; dark ones never."""
+    """The smallest and the largest number below 1 pick the first and the last light that has power."""
     dark = emitter(PANEL, radiance=0.0)
     scene = device_scene([dark, emitter(CEILING)], [PointLight((0, 1, 0), 0.0), POINT])
     assert scene.struct.light_count == 3
@@ -285,9 +285,9 @@ def test_all_lights_together():
 
 
 def test_a_weak_light_beside_a_strong_one_is_kept():
-    """A lamp that has a billionth of the sun's power lights what is near it: it is picked, and unbiased when picked.
+    """A lamp with a billionth of the sun's power lights what is near it, so it has to be picked at times.
 
-    Running sums in float32 would round its share to 0. Every light must have a probability above 0 in the kernel's sum.
+    A running sum in float32 would round its share to 0, and its light would be missing from the picture.
     """
     lamp = PointLight(position=(0.0, 0.5, 0.0), intensity=1e-2)
     sun = DistantLight(direction=(0.0, -1.0, 0.0), irradiance=1e6)

@@ -20,7 +20,12 @@ else:
     import tomli as tomllib  # pytest brings it there
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
-PACKAGES = {"warpgi": "warpgi", "warpgi.methods": "warpgi/methods", "warpgi.kernels": "kernels", "warpgi.scenes": "scenes"}
+PACKAGES = {
+    "warpgi": "warpgi",
+    "warpgi.methods": "warpgi/methods",
+    "warpgi.kernels": "kernels",
+    "warpgi.scenes": "scenes",
+}
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +52,9 @@ def test_wheel_holds_every_module(tmp_path):
     """The built wheel has each module of each package and the licence, and nothing of tests or bench."""
     pytest.importorskip("build", reason="the test extra brings it")
     subprocess.run(
-        [sys.executable, "-m", "build", "--wheel", "--outdir", str(tmp_path), str(ROOT)], check=True, capture_output=True
+        [sys.executable, "-m", "build", "--wheel", "--outdir", str(tmp_path), str(ROOT)],
+        check=True,
+        capture_output=True,
     )
     (wheel,) = tmp_path.glob("*.whl")
     names = set(zipfile.ZipFile(wheel).namelist())
@@ -61,7 +68,12 @@ def test_wheel_holds_every_module(tmp_path):
 
 def test_imports_run_one_way():
     """kernels know kernels alone, warpgi does not know scenes but for the door in its front, nobody says `kernels`."""
-    allowed = {"kernels": ("warpgi.kernels",), "warpgi/methods": ("warpgi",), "warpgi": ("warpgi",), "scenes": ("warpgi",)}
+    allowed = {
+        "kernels": ("warpgi.kernels",),
+        "warpgi/methods": ("warpgi",),
+        "warpgi": ("warpgi",),
+        "scenes": ("warpgi",),
+    }
     for folder, roots in allowed.items():
         for path in sources(folder):
             for node in ast.walk(ast.parse(path.read_text())):

@@ -46,7 +46,7 @@ def gather(
     n = scene.face_normals[face]
     d = to_world(make_frame(n), square_to_cosine_hemisphere(sample_2d(sampler, 102)))
     o = offset_origin(a * bary[0] + b * bary[1] + c * bary[2], n, ray_offset(a, b, c), d)
-    path = trace_path(scene, settings, sampler, o, d)
+    path = trace_path(scene, settings, sampler, 0, o, d, 0.0)
     result[i, 0] = path.emission
     result[i, 1] = path.direct + path.indirect
 

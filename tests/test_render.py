@@ -85,9 +85,7 @@ def test_degenerate_triangles_are_dropped_and_counted():
     """Triangles without area leave the picture as it is and are reported."""
     clean = scene_of(lights=[gi.Environment(1.0)])
     vertices = [*TRIANGLE, (0.5, 0.0, 0.0)]
-    spoilt = scene_of(
-        gi.Shape(vertices, [(0, 1, 2), (1, 1, 2), (0, 3, 1), (2, 2, 2)]), lights=[gi.Environment(1.0)]
-    )
+    spoilt = scene_of(gi.Shape(vertices, [(0, 1, 2), (1, 1, 2), (0, 3, 1), (2, 2, 2)]), lights=[gi.Environment(1.0)])
     a, b = (gi.render(scene, gi.PathTracing(spp=4), size=(8, 8)) for scene in (clean, spoilt))
     assert (a.counts["degenerate_triangles"], b.counts["degenerate_triangles"]) == (0, 3)
     np.testing.assert_array_equal(a.image, b.image)

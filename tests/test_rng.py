@@ -174,8 +174,8 @@ def test_sobol_pixels_and_pairs_are_scrambled_apart():
     bits = (u.astype(np.float64) * 2**24).astype(np.int64).swapaxes(1, 2).reshape(-1, 16, 2)
     as_sets = np.sort(bits[..., 0] << 24 | bits[..., 1], axis=1)
     assert len(np.unique(as_sets, axis=0)) == len(as_sets)
-    # 16 samples of a block of 16 share what their leading four bits leave over; Owen scrambling tells it apart, while an
-    # exclusive or by one number would not
+    # unscrambled, the 16 numbers of a block differ in their leading four bits alone, and an exclusive or by one number
+    # leaves it so; Owen scrambling does not
     rest = np.sort(bits[..., 0] & 0xFFFFF, axis=1)
     assert (np.diff(rest, axis=1) == 0).mean() < 1e-3
 

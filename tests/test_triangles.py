@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 
 import numpy as np
@@ -104,7 +105,7 @@ class Rays:
         n = np.cross(e1, e2)
         size = np.linalg.norm(e1, axis=1) * np.linalg.norm(e2, axis=1)
         faces, hits, sure = [], [], []
-        for origin, direction in zip(o.astype(np.float64), d.astype(np.float64)):
+        for origin, direction in zip(o.astype(np.float64), d.astype(np.float64), strict=True):
             s = origin - corner[:, 0]
             det = -(n @ direction)
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -218,7 +219,7 @@ def test_axis_parallel_rays():
             d[i, (i + 1) % 3] = 0.0
     assert compare(rays, o, d) > 300
     plus, minus = rays.trace(o, np.where(d == 0.0, 0.0, d)), rays.trace(o, np.where(d == 0.0, -0.0, d))
-    for a, b in zip(plus, minus):
+    for a, b in zip(plus, minus, strict=True):
         assert np.array_equal(a, b)
 
 
@@ -237,23 +238,42 @@ def box(cells: int, half: np.ndarray | float = 1.0) -> tuple[np.ndarray, np.ndar
     return ((2.0 * keys / cells - 1.0) * half).astype(np.float32), index.ravel()[np.concatenate(parts)]
 
 
-def test_rays_in_the_plane_of_a_side():
-    """A ray that runs within a side of a closed box meets the wall where the side ends: flat boxes have an inside."""
-    rays = Rays(*box(4))
+@pytest.mark.parametrize("middle", [0.0, 1.0])
+def test_rays_in_the_plane_of_a_side(middle):
+    """A ray that runs within a side of a closed box meets the wall where the side ends: flat boxes have an inside.
+
+    With its middle at 1 the box has sides at 0, which no margin relative to a coordinate moves.
+    """
+    points, faces = box(4)
+    rays = Rays(points + np.float32(middle), faces)
     rng = np.random.default_rng(11)
-    for axis in range(3):
-        for side in (-1.0, 1.0):
-            o = rng.uniform(-0.9, 0.9, (300, 3))
-            d = directions(300, rng)
-            o[:, axis], d[:, axis] = side, 0.0
-            d[:100, (axis + 1) % 3] = 0.0
-            d[:100, (axis + 2) % 3] = rng.choice([-1.0, 1.0], 100)
-            o, d = o.astype(np.float32), d.astype(np.float32)
-            found, hits, _ = rays.trace(o, d)
-            assert (found >= 0).all()
-            end = o.astype(np.float64) + d * hits[:, :1].astype(np.float64)
-            others = np.delete(end, axis, axis=1)
-            assert np.abs(np.abs(others).max(axis=1) - 1.0).max() < 8 * ULP
+    for axis, side, zero in itertools.product(range(3), (-1.0, 1.0), (0.0, -0.0)):
+        o = rng.uniform(-0.9, 0.9, (300, 3))
+        d = directions(300, rng)
+        o[:, axis], d[:, axis] = side, zero
+        d[:100, (axis + 1) % 3] = 0.0
+        d[:100, (axis + 2) % 3] = np.sign(d[:100, (axis + 2) % 3])
+        o, d = (o + middle).astype(np.float32), d.astype(np.float32)
+        found, hits, _ = rays.trace(o, d)
+        assert (found >= 0).all()
+        end = o.astype(np.float64) + d * hits[:, :1].astype(np.float64) - middle
+        others = np.delete(end, axis, axis=1)
+        assert np.abs(np.abs(others).max(axis=1) - 1.0).max() < 8 * ULP
+
+
+def test_watertight_from_afar():
+    """None of a million rays from 100 000 times its size away passes through a closed box.
+
+    So far off, rounding moves a box of the tree against its triangles by hundredths, which only the factor of Ize's
+    test makes up for: 10 of these rays get through without it.
+    """
+    count = 1_000_000
+    rays = Rays(*box(64))
+    rng = np.random.default_rng(16)
+    o = directions(count, rng) * np.float32(1e5)
+    found, _, blocked = rays.trace(o, rng.uniform(-0.4, 0.4, (count, 3)) - o)
+    assert np.count_nonzero(found < 0) == 0
+    assert np.count_nonzero(~blocked) == 0
 
 
 @pytest.mark.parametrize("shape", ["box", "sphere"])
@@ -331,7 +351,7 @@ def nasty(name: str) -> tuple[np.ndarray, np.ndarray]:
     if name == "shrinking":  # one inside the other, down to the smallest float32 that has all its digits
         triangles = corner * (0.97 ** np.arange(2800))[:, None, None]
     elif name == "receding":  # each twice as far as the one before and as large
-        triangles = (corner + [3.0, 0.0, 0.0]) * (2.0 ** np.arange(-60, 60))[:, None, None]
+        triangles = (corner + np.array([3.0, 0.0, 0.0])) * (2.0 ** np.arange(-60, 60))[:, None, None]
     elif name == "copies":
         triangles = np.broadcast_to(corner, (10_000, 3, 3))
     elif name == "concentric":  # centroids coincide, sizes do not
@@ -378,16 +398,16 @@ def leaving(mesh: str) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("mesh", ["box", "sphere", "soup"])
 @pytest.mark.parametrize(("scale", "shift"), [(1.0, 0.0), (1e-3, 0.0), (1e3, 0.0), (1.0, 1e4), (1e-3, 1e6)])
 def test_next_ray_never_meets_its_own_triangle(mesh, scale, shift):
-    """Of 100 000 rays that leave a surface, to either side, none meets the triangle that it left.
+    """Of 20 000 rays that leave a surface, to either side, none meets the triangle that it left; so on 15 meshes.
 
-    A small part of them is almost within the surface. Meshes are as large as 1000, as small as 1/1000, and far away.
+    A tenth of them is almost within the surface. Meshes are as large as 1000, as small as 1/1000, and far away.
     """
     points, faces = leaving(mesh)
     points = np.asarray(points, np.float64) * scale + shift * np.array([1.0, -0.7, 0.3])
     camera = Camera(position=(0, 0, 0), target=(0, 0, 1))
     scene = DeviceScene(Scene([Shape(points, faces)], camera), Device("cpu"))
     rng = np.random.default_rng(15)
-    count = 100_000 // 5
+    count = 20_000
     kept = len(scene.scene.shapes[0].faces)
     own = rng.integers(kept, size=count).astype(np.int32)
     bary = rng.dirichlet((1.0, 1.0, 1.0), count).astype(np.float32)

@@ -8,11 +8,13 @@ from warpgi.device import Device
 from warpgi.lights import DistantLight, Environment, PointLight, SpotLight
 from warpgi.load import load_scene
 from warpgi.materials import Conductor, Dielectric, Diffuse, Emissive, Mirror, Texture
-from warpgi.methods import METHODS, PathTracing, Sampler
+from warpgi.methods import METHODS, LightField, PathTracing, Sampler
 from warpgi.metrics import compare
 from warpgi.progress import Progress
 from warpgi.render import Interrupted, render, versions
 from warpgi.result import Render
+from warpgi.samples import SampleBuffer
+from warpgi.sampling import sample
 from warpgi.scene import Scene, Shape
 
 __all__ = [
@@ -26,11 +28,13 @@ __all__ = [
     "Emissive",
     "Environment",
     "Interrupted",
+    "LightField",
     "Mirror",
     "PathTracing",
     "PointLight",
     "Progress",
     "Render",
+    "SampleBuffer",
     "Sampler",
     "Scene",
     "Shape",
@@ -39,6 +43,7 @@ __all__ = [
     "compare",
     "load_scene",
     "render",
+    "sample",
     "scenes",
     "versions",
 ]

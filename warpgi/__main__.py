@@ -16,6 +16,7 @@ import tyro
 import warpgi as gi
 from warpgi.image import check_output
 from warpgi.load import SUFFIXES
+from warpgi.progress import RAY_KINDS
 
 MISUSE = 2  # exit status for a caller's mistake
 INTERRUPTED = 130
@@ -64,8 +65,8 @@ class RenderCommand:
         except gi.Interrupted as stop:
             if stop.render is not None:
                 self._keep(stop.render)
-                total = self.method.spp
-                print(f"interrupted: the picture holds {stop.render.spp} of {total} samples per pixel")
+                passes = stop.passes
+                print(f"interrupted: the picture holds {passes.done} of {passes.total} {passes.unit}")
             raise
         self._keep(picture)
 
@@ -75,8 +76,10 @@ class RenderCommand:
         stages = ", ".join(f"{stage} {seconds:.2f} s" for stage, seconds in picture.timings.items() if seconds >= 0.005)
         height, width = picture.image.shape[:2]
         print(f"{picture.scene}, {picture.method}, {picture.spp} spp, {width} x {height} on {picture.device}: {stages}")
-        rays = picture.counts["closest_hit_rays"] + picture.counts["shadow_rays"]
-        print(f"{rays} rays, {rays / max(picture.timings['estimate'], 1e-9) / 1e6:.2f} M rays/s")
+        rays = {kind: picture.counts[kind] for kind in RAY_KINDS if kind in picture.counts}
+        seconds = picture.timings["prepare"] + picture.timings["estimate"]
+        kinds = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in rays.items())
+        print(f"{kinds}: {sum(rays.values()) / max(seconds, 1e-9) / 1e6:.2f} M rays/s")
         if picture.counts["nonfinite"]:
             _warn(f"{picture.counts['nonfinite']} samples were not finite and were dropped")
         if picture.counts["degenerate_triangles"]:

@@ -93,5 +93,19 @@ def count(name: str, value: Any, lower: int = 1, upper: int = 2**31 - 1) -> int:
     return int(value)
 
 
+def image_size(value: Any) -> tuple[int, int]:
+    """`value` as (width, height) in pixels, fewer than 2^31 of them.
+
+    Raises:
+        TypeError, ValueError: it is no such thing.
+    """
+    if not isinstance(value, (tuple, list)) or len(value) != 2:
+        raise ValueError(f"size is {value!r}, expected (width, height)")
+    width, height = (count(name, number) for name, number in zip(("width", "height"), value, strict=True))
+    if width * height >= 2**31:
+        raise ValueError(f"size is {width} x {height}, expected fewer than 2^31 pixels")
+    return width, height
+
+
 def _shape(shape: tuple[int | None, ...]) -> str:
     return "(" + ", ".join("N" if n is None else str(n) for n in shape) + ("," if len(shape) == 1 else "") + ")"

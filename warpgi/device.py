@@ -66,10 +66,23 @@ class Device:
             # a launch on cpu asks for blocks of one thread; without that the module would be compiled twice
             module.load(self.warp, None if self.is_cuda else 1)
 
-    def launch(self, kernel: wp.Kernel, count: int, inputs: Sequence[Any], outputs: Sequence[Any] = ()) -> None:
+    @property
+    def slots(self) -> int:
+        """How many threads of `launch` may write at a time; with atomics, which a GPU has and a CPU has not, one."""
+        return 1 if self.is_cuda else self.threads
+
+    def launch(
+        self,
+        kernel: wp.Kernel,
+        count: int,
+        inputs: Sequence[Any],
+        outputs: Sequence[Any] = (),
+        with_slot: bool = False,
+    ) -> None:
         """Runs `kernel` for the indices 0 to count - 1 and returns when all are done on cpu, at once on cuda.
 
-        The kernel's first parameter is an int offset that it adds to its thread number; `inputs` and `outputs` follow.
+        The kernel's first parameter is an int offset that it adds to its thread number, the second, `with_slot`, the
+        number of the slot that it alone writes to; `inputs` and `outputs` follow.
         A Ctrl-C waits for the end of the launch, so that what it writes is whole.
         """
         if count <= 0:
@@ -77,28 +90,29 @@ class Device:
         self.load([kernel])
         threads = min(self.threads, count)
         if self.is_cuda or (threads == 1 and self.chunk is None):
-            _launch(kernel, count, 0, inputs, outputs, self.warp)
+            _launch(kernel, count, [0, 0] if with_slot else [0], inputs, outputs, self.warp)
             return
         chunk = self.chunk or max(1, -(-count // (threads * CHUNKS_PER_THREAD)))
         starts = iter(range(0, count, chunk))
         lock = threading.Lock()
         stop = threading.Event()
 
-        def work() -> None:
+        def work(slot: int) -> None:
             while not stop.is_set():
                 with lock:
                     start = next(starts, None)
                 if start is None:
                     return
                 try:
-                    _launch(kernel, min(chunk, count - start), start, inputs, outputs, self.warp)
+                    place = [start, slot] if with_slot else [start]
+                    _launch(kernel, min(chunk, count - start), place, inputs, outputs, self.warp)
                 except BaseException:
                     stop.set()
                     raise
 
         if self._pool is None:
             self._pool = ThreadPoolExecutor(self.threads, thread_name_prefix="warpgi")
-        jobs = [self._pool.submit(work) for _ in range(threads)]
+        jobs = [self._pool.submit(work, slot) for slot in range(threads)]
         interrupt: KeyboardInterrupt | None = None
         while True:
             try:
@@ -133,8 +147,8 @@ def as_device(device: str | Device | None) -> Device:
     return Device(device)
 
 
-def _launch(kernel: wp.Kernel, count: int, offset: int, inputs: Sequence, outputs: Sequence, device: Any) -> None:
-    wp.launch(kernel, count, inputs=[offset, *inputs], outputs=list(outputs), device=device, record_tape=False)
+def _launch(kernel: wp.Kernel, count: int, place: list[int], inputs: Sequence, outputs: Sequence, device: Any) -> None:
+    wp.launch(kernel, count, inputs=[*place, *inputs], outputs=list(outputs), device=device, record_tape=False)
 
 
 def _cuda_count() -> int:

@@ -21,6 +21,10 @@ KINDS = {
     Dielectric: kernels.DIELECTRIC,
 }
 
+# Running sums of shares are float32: a light too weak for them would never be picked, so that each shape or light gets
+# this share of the power at least, divided by their number.
+LEAST_SHARE = 1e-3
+
 
 class DeviceScene:
     """What kernels see of a scene, positions taken relative to its centre so that float32 serves far-away scenes.
@@ -130,6 +134,10 @@ class DeviceScene:
             if watts > 0.0:
                 parts.append(part)
                 powers.append(np.array([watts]))
+        floor = LEAST_SHARE * sum(part.sum() for part in powers) / max(len(powers), 1)
+        raise_by = [max(1.0, floor / part.sum()) for part in powers]
+        powers = [part * factor for part, factor in zip(powers, raise_by, strict=True)]
+        density = {i: value * factor for (i, value), factor in zip(density.items(), raise_by, strict=False)}
         power = np.concatenate(powers) if powers else np.zeros(0)
         total = float(power.sum()) or 1.0
         struct = self.struct
@@ -160,7 +168,7 @@ class DeviceScene:
         record["direction"] = light.direction
         record["cone_scale"] = scale
         record["cone_offset"] = -outer * scale
-        return record, float(np.mean(light.intensity)) * 2.0 * np.pi * (1.0 - 0.5 * (inner + outer))
+        return record, float(np.mean(light.intensity)) * 2.0 * np.pi * (1.0 - (2.0 * inner + outer) / 3.0)
 
     def _shape_record(self, shape: Shape, light_pdf: float) -> kernels.ShapeRecord:
         record = kernels.ShapeRecord()

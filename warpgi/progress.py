@@ -6,15 +6,20 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+#: Counts that are rays; camera rays are among the closest-hit rays.
+RAY_KINDS = ("closest_hit_rays", "shadow_rays", "reconstruction_rays")
+
 
 @dataclass(frozen=True)
 class Progress:
     """Where a render stands after a pass."""
 
     done: int
-    """Samples per pixel so far."""
+    """Passes' units so far: samples per pixel, or reconstruction rays per primary hit."""
     total: int
-    """Samples per pixel in the end."""
+    """Units in the end."""
+    unit: str
+    """What they are."""
     seconds: float
     """Since the first pass began."""
     counts: dict[str, int]
@@ -22,8 +27,8 @@ class Progress:
 
     @property
     def rays_per_second(self) -> float:
-        """Closest-hit and shadow rays together."""
-        rays = self.counts.get("closest_hit_rays", 0) + self.counts.get("shadow_rays", 0)
+        """Rays of all kinds together."""
+        rays = sum(self.counts.get(kind, 0) for kind in RAY_KINDS)
         return rays / max(self.seconds, 1e-9)
 
 
@@ -42,16 +47,16 @@ def progress_bar(progress: bool | Callable[[Progress], None]) -> Iterator[Callab
 
     columns = (
         BarColumn(),
-        TextColumn("{task.completed}/{task.total} spp"),
+        TextColumn("{task.completed}/{task.total} {task.fields[unit]}"),
         TextColumn("{task.fields[rate]:.2f} M rays/s"),
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
     )
     with Bar(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task("render", total=None, rate=0.0)
+        task = bar.add_task("render", total=None, rate=0.0, unit="")
 
         def report(state: Progress) -> None:
-            bar.update(task, completed=state.done, total=state.total, rate=state.rays_per_second / 1e6)
+            bar.update(task, completed=state.done, total=state.total, rate=state.rays_per_second / 1e6, unit=state.unit)
 
         yield report

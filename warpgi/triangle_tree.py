@@ -41,6 +41,8 @@ def build_triangle_tree(points: np.ndarray, faces: np.ndarray) -> dict[str, np.n
     tree.upper = wp.zeros(count, dtype=wp.vec3, device=cpu)
     tree.order = ints(len(faces))
     wp.launch(tree_build.read_tree, count, inputs=[0, mesh.id], outputs=[tree], device=cpu)
+    count = _split_large_leaves(tree, points[faces])
+    tree.count = ints(count)
     stack = ints(count + 2)
     wp.launch(tree_build.count_triangles, 1, inputs=[tree, root], outputs=[stack], device=cpu)
 
@@ -66,3 +68,33 @@ def build_triangle_tree(points: np.ndarray, faces: np.ndarray) -> dict[str, np.n
         "blocks": blocks.numpy()[: block_count * BLOCK_FLOATS].copy(),
         "faces": block_faces.numpy()[: block_count * WIDTH].copy(),
     }
+
+
+def _split_large_leaves(tree: tree_build.BinaryTree, corners: np.ndarray) -> int:
+    """Halves leaves of more than WIDTH triangles, which `wp.Mesh` makes 32 levels deep; returns the number of nodes."""
+    sizes = (tree.right.numpy() - tree.left.numpy()) * (tree.leaf.numpy() != 0)
+    todo = np.flatnonzero(sizes > WIDTH).tolist()
+    if not todo:
+        return len(sizes)
+    names = ("left", "right", "leaf", "lower", "upper")
+    left, right, leaf, lower, upper = columns = [list(getattr(tree, name).numpy()) for name in names]
+    order, middle = tree.order.numpy(), corners.mean(axis=1)
+    while todo:
+        node = todo.pop()
+        first, last = left[node], right[node]
+        places = order[first:last]
+        order[first:last] = places[np.argsort(middle[places][:, np.ptp(middle[places], axis=0).argmax()])]
+        half = (first + last) // 2
+        left[node], right[node], leaf[node] = len(leaf), len(leaf) + 1, 0
+        for a, b in ((first, half), (half, last)):
+            inside = corners[order[a:b]]
+            if b - a > WIDTH:
+                todo.append(len(leaf))
+            row = (a, b, 1, inside.min(axis=(0, 1)), inside.max(axis=(0, 1)))
+            for values, value in zip(columns, row, strict=True):
+                values.append(value)
+    for name, values in zip(names, columns, strict=True):
+        dtype = wp.vec3 if name in ("lower", "upper") else int
+        setattr(tree, name, wp.array(np.array(values), dtype=dtype, device="cpu"))
+    tree.order = wp.array(order, dtype=int, device="cpu")
+    return len(leaf)

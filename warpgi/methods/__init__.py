@@ -1,8 +1,42 @@
 """The methods, by the name that the command line and the bench know them by."""
 
+from typing import Any, Protocol
+
+import warp as wp
+
+from warpgi.film import Film
+from warpgi.job import Job
+from warpgi.methods.light_field import LightField
 from warpgi.methods.path import PathTracing, Sampler
 
-#: Name of a method, the stem of its files, -> its settings.
-METHODS = {"path": PathTracing}
 
-__all__ = ["METHODS", "PathTracing", "Sampler"]
+class Method(Protocol):
+    """What `render` asks of a method's settings."""
+
+    @property
+    def kernels(self) -> tuple[wp.Kernel, ...]:
+        """What it launches, to be compiled first."""
+
+    def passes(self) -> tuple[int, str]:
+        """How many units of work there are, and what they are called."""
+
+    def device_bytes(self, size: tuple[int, int]) -> int:
+        """Device memory it takes beside scene and film, for a picture of (width, height)."""
+
+    def prepare(self, job: Job, film: Film) -> Any:
+        """Builds what it needs for this scene: its state."""
+
+    def estimate(self, job: Job, state: Any, film: Film, first: int, count: int) -> None:
+        """Does units `first` to `first + count - 1` of its passes."""
+
+    def finish(self, job: Job, state: Any, film: Film) -> None:
+        """Makes the film a picture out of the units done so far."""
+
+    def counts(self, state: Any) -> dict[str, int]:
+        """What it counts beside the film."""
+
+
+#: Name of a method, the stem of its files, -> its settings.
+METHODS: dict[str, type] = {"path": PathTracing, "light-field": LightField}
+
+__all__ = ["METHODS", "LightField", "Method", "PathTracing", "Sampler"]

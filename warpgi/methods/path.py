@@ -8,9 +8,9 @@ from enum import Enum
 import warp as wp
 
 from warpgi import checks
+from warpgi.film import Film
 from warpgi.job import Job
 from warpgi.kernels import rng
-from warpgi.kernels.film import Film
 from warpgi.kernels.path import PathSettings, trace_paths
 
 
@@ -61,7 +61,15 @@ class PathTracing:
         """What it launches."""
         return (trace_paths,)
 
-    def prepare(self, job: Job) -> PathSettings:
+    def passes(self) -> tuple[int, str]:
+        """Samples per pixel, the unit of its passes."""
+        return self.spp, "spp"
+
+    def device_bytes(self, size: tuple[int, int]) -> int:
+        """Device memory it takes beside scene and film."""
+        return 0
+
+    def prepare(self, job: Job, film: Film) -> PathSettings:
         """The kernel's settings: path tracing builds nothing for a scene."""
         settings = PathSettings()
         settings.max_depth = self.max_depth or NEVER
@@ -70,7 +78,15 @@ class PathTracing:
         settings.seed = job.seed
         return settings
 
-    def estimate(self, job: Job, state: PathSettings, film: Film, first_sample: int, sample_count: int) -> None:
-        """Adds samples `first_sample` to `first_sample + sample_count - 1` of every pixel of the film's band."""
-        inputs = [job.scene.struct, job.camera, state, first_sample, sample_count]
-        job.device.launch(trace_paths, film.count.size, inputs, [film])
+    def estimate(self, job: Job, state: PathSettings, film: Film, first: int, count: int) -> None:
+        """Adds samples `first` to `first + count - 1` of every pixel."""
+        for band in film.bands:
+            inputs = [job.scene.struct, job.camera, state, first, count]
+            job.device.launch(trace_paths, len(band), inputs, [film.load(band)])
+
+    def finish(self, job: Job, state: PathSettings, film: Film) -> None:
+        """Nothing: every pass left a finished picture in the film."""
+
+    def counts(self, state: PathSettings) -> dict[str, int]:
+        """Nothing beside the film's counts."""
+        return {}

@@ -1,0 +1,34 @@
+"""Eight lanes at a time, for native code: which of them passed a test, as bits.
+
+Tests run in plain loops over eight lanes, which a CPU's compiler turns into vector instructions and a GPU runs as they
+are; only the step from a vector of answers to bits needs saying twice.
+"""
+
+#: Opens native code: `lane_mask` packs eight answers, 0 or 1, into bits; `next_lane` takes the lowest bit out.
+LANES_HEAD = """
+#if defined(__CUDA_ARCH__)
+    auto lane_mask = [](const int* met) {
+        unsigned mask = 0u;
+        for (int k = 0; k < 8; ++k)
+            mask |= (unsigned)met[k] << k;
+        return mask;
+    };
+    auto next_lane = [](unsigned& mask) {
+        const int k = __ffs((int)mask) - 1;
+        mask &= mask - 1u;
+        return k;
+    };
+#else
+    typedef int lanes_of_int __attribute__((vector_size(32), aligned(4)));
+    typedef bool lanes_of_bool __attribute__((ext_vector_type(8)));
+    auto lane_mask = [](const int* met) {
+        const lanes_of_int answers = *(const lanes_of_int*)met;
+        return (unsigned)__builtin_bit_cast(unsigned char, __builtin_convertvector(answers != 0, lanes_of_bool));
+    };
+    auto next_lane = [](unsigned& mask) {
+        const int k = __builtin_ctz(mask);
+        mask &= mask - 1u;
+        return k;
+    };
+#endif
+"""

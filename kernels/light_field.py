@@ -1,0 +1,207 @@
+"""Light-field reconstruction (Lehtinen et al. 2012): sizing, shrinking and reconstruction rays."""
+
+import warp as wp
+
+from warpgi.kernels.film import Film
+from warpgi.kernels.rng import SOBOL, make_sampler, sample_2d
+from warpgi.kernels.sampling import make_frame, square_to_cosine_hemisphere, to_world
+from warpgi.kernels.splats import SplatTree, first_surface, nearest_distance2, shrink_crossed
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Rays:
+    """Input rays of the splats, in the samples' own order."""
+
+    origins: wp.array[wp.vec3]
+    hits: wp.array[wp.vec3]
+    order: wp.array[int]  # place in the tree -> sample
+
+
+@wp.struct
+class Sky:
+    """What input rays saw that left the scene, by direction, on an octahedral map."""
+
+    size: int  # 0: none did
+    radiance: wp.array[wp.vec3]
+
+
+@wp.func
+def octahedral(d: wp.vec3):
+    """Unit square coordinates of a direction (Meyer et al. 2010)."""
+    s = wp.abs(d[0]) + wp.abs(d[1]) + wp.abs(d[2])
+    u = d[0] / s
+    v = d[1] / s
+    if d[2] < 0.0:
+        w = (1.0 - wp.abs(v)) * wp.where(u >= 0.0, 1.0, -1.0)
+        v = (1.0 - wp.abs(u)) * wp.where(v >= 0.0, 1.0, -1.0)
+        u = w
+    return wp.vec2(0.5 * u + 0.5, 0.5 * v + 0.5)
+
+
+@wp.func
+def sky_radiance(sky: Sky, d: wp.vec3):
+    uv = octahedral(d)
+    x = wp.min(int(uv[0] * float(sky.size)), sky.size - 1)
+    y = wp.min(int(uv[1] * float(sky.size)), sky.size - 1)
+    return sky.radiance[y * sky.size + x]
+
+
+@wp.kernel
+def size_splats(offset: int, tree: SplatTree, rays: Rays, k: int, stretch: float, radius2: wp.array[float]):
+    """One thread finds one splat's squared radius: the distance of its k-th neighbour, the splat itself counted."""
+    i = offset + wp.tid()
+    r2 = nearest_distance2(tree, i, k, stretch)
+    if r2 < 0.0:
+        # no neighbour at all: something of the size of what it was seen from
+        half = 0.5 * wp.length(rays.hits[rays.order[i]] - rays.origins[rays.order[i]])
+        r2 = half * half
+    radius2[i] = r2
+
+
+@wp.func
+def retrace(tree: SplatTree, rays: Rays, i: int, slot: int, radius2: wp.array[float], margin: float, noise: float):
+    j = rays.order[i]
+    o = rays.origins[j]
+    d = rays.hits[j] - o
+    length = wp.length(d)
+    end = wp.max(margin * length, noise)
+    if length <= 2.0 * end:
+        return 0
+    return shrink_crossed(tree, o, d / length, length, end, i, slot, radius2)
+
+
+@wp.kernel
+def shrink_splats(
+    offset: int, slot: int, tree: SplatTree, rays: Rays, margin: float, noise: float, radius2: wp.array[float]
+):
+    """One thread retraces one input ray and shrinks, in its slot, the splats that it crosses before its end."""
+    retrace(tree, rays, offset + wp.tid(), slot, radius2, margin, noise)
+
+
+@wp.kernel
+def count_crossed(
+    offset: int, tree: SplatTree, rays: Rays, margin: float, noise: float, none: wp.array[float], crossed: wp.array[int]
+):
+    """One thread counts the splats that one input ray crosses before its end."""
+    i = offset + wp.tid()
+    crossed[i] = retrace(tree, rays, i, -1, none, margin, noise)
+
+
+@wp.struct
+class Receivers:
+    """Where light is gathered."""
+
+    sample: wp.array[int]  # number of the sample whose origin it is
+    origins: wp.array[wp.vec3]
+    normals: wp.array[wp.vec3]
+    spp: int  # samples of a pixel, which are neighbours; 0: `pixels` and `places` say which is which
+    pixels: wp.array[int]
+    places: wp.array[int]  # number of a sample in its pixel
+
+
+@wp.struct
+class Gathered:
+    """Sums over the rays of each receiver so far."""
+
+    radiance: wp.array[wp.vec3]
+    near: wp.array[float]  # rays that met a surface within reach
+    counts: wp.array[wp.vec4i]  # rays without support, to the sky, cut short; undersampled surfaces passed through
+
+
+@wp.kernel
+def reconstruct(
+    offset: int,
+    tree: SplatTree,
+    sky: Sky,
+    receivers: Receivers,
+    rays_each: int,
+    first_ray: int,
+    ray_count: int,
+    seed: int,
+    noise: float,
+    reach: float,
+    gathered: Gathered,
+):
+    """One thread owns a receiver and sends `ray_count` of its `rays_each` cosine-distributed reconstruction rays."""
+    i = offset + wp.tid()
+    j = receivers.sample[i]
+    o = receivers.origins[j]
+    frame = make_frame(receivers.normals[j])
+    pixel = int(0)
+    place = int(0)
+    if receivers.spp > 0:
+        pixel = j // receivers.spp
+        place = j % receivers.spp
+    else:
+        pixel = receivers.pixels[j]
+        place = receivers.places[j]
+    total = gathered.radiance[i]
+    near = gathered.near[i]
+    counts = gathered.counts[i]
+    for ray in range(first_ray, first_ray + ray_count):
+        # one sequence a pixel, cut into the shares of its samples
+        sampler = make_sampler(seed, pixel, place * rays_each + ray, SOBOL)
+        d = to_world(frame, square_to_cosine_hemisphere(sample_2d(sampler, 0)))
+        s = first_surface(tree, o, d, noise, reach)
+        if s[3] > 0.0:
+            total = total + wp.vec3(s[0], s[1], s[2]) / s[3]
+            near = near + s[4] / s[3]
+        elif sky.size > 0:
+            total = total + sky_radiance(sky, d)
+            counts[1] = counts[1] + 1
+        else:
+            counts[0] = counts[0] + 1
+        counts[2] = counts[2] + int(s[6])
+        counts[3] = counts[3] + int(s[7])
+    gathered.radiance[i] = total
+    gathered.near[i] = near
+    gathered.counts[i] = counts
+
+
+@wp.func
+def mean_radiance(gathered: Gathered, i: int, ray_count: int):
+    """Mean over the rays that found support or the sky."""
+    return gathered.radiance[i] / float(wp.max(ray_count - gathered.counts[i][0], 1))
+
+
+@wp.kernel
+def relight_splats(
+    offset: int,
+    receivers: Receivers,
+    gathered: Gathered,
+    ray_count: int,
+    hit_direct: wp.array[wp.vec3],
+    throughput: wp.array[wp.vec3],
+    radiance: wp.array[wp.vec3],
+):
+    """One thread replaces one sample's radiance by its direct light and what was reconstructed (section 4)."""
+    i = offset + wp.tid()
+    j = receivers.sample[i]
+    radiance[j] = hit_direct[j] + wp.cw_mul(throughput[j], mean_radiance(gathered, i, ray_count))
+
+
+@wp.kernel
+def reflect(
+    offset: int,
+    receivers: Receivers,
+    gathered: Gathered,
+    ray_count: int,
+    albedo: wp.array[wp.vec3],
+    reflected: wp.array[wp.vec3],
+):
+    """One thread writes the radiance that one receiver reflects: albedo times the mean, as rays follow the cosine."""
+    i = offset + wp.tid()
+    j = receivers.sample[i]
+    reflected[j] = wp.cw_mul(albedo[j], mean_radiance(gathered, i, ray_count))
+
+
+@wp.kernel
+def add_reflected(offset: int, film: Film, reflected: wp.array[wp.vec3], spp: int):
+    """One thread owns one pixel of the band and adds the mean of its samples to the film's indirect light."""
+    i = offset + wp.tid()
+    total = wp.vec3(0.0)
+    for k in range(spp):
+        total = total + reflected[(film.first_pixel + i) * spp + k]
+    film.indirect[i] = film.indirect[i] + total / float(spp)

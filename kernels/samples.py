@@ -1,0 +1,146 @@
+"""The input of light-field reconstruction: secondary rays from the path tracer (Lehtinen et al. 2012, section 2.1)."""
+
+import warp as wp
+
+from warpgi.kernels.bsdf import sample
+from warpgi.kernels.camera import Camera, camera_ray
+from warpgi.kernels.direct import add_features, direct_light, emitted, facing_normal, reflects
+from warpgi.kernels.film import Film, PathSample, add_sample
+from warpgi.kernels.path import CAMERA_PAIRS, VERTEX_PAIRS, PathSettings, add_light, trace_path
+from warpgi.kernels.rng import make_sampler, sample_2d
+from warpgi.kernels.scene import DIELECTRIC, DIFFUSE, MIRROR, Scene, closest_hit, offset_origin, surface_at
+
+wp.set_module_options({"enable_backward": False})
+
+NO_HIT = wp.constant(1.0e11)  # coordinates from 1e10 on say that a ray met nothing
+
+# Mirrors and glass before the first surface that scatters light; a longer chain is left dark.
+MAX_CHAIN = wp.constant(16)
+
+
+@wp.struct
+class SampleArrays:
+    first_sample: int  # of the band's first pixel
+    origin: wp.array[wp.vec3]  # primary hit, or NO_HIT
+    origin_normal: wp.array[wp.vec3]
+    albedo: wp.array[wp.vec3]  # of the primary hit, times what mirrors before it left
+    hit: wp.array[wp.vec3]  # of the secondary ray, or its direction times NO_HIT
+    hit_normal: wp.array[wp.vec3]
+    radiance: wp.array[wp.vec3]  # along the secondary ray, without emission
+    throughput: wp.array[wp.vec3]  # albedo at the secondary hit; empty where nobody asked
+    hit_direct: wp.array[wp.vec3]  # its direct light; empty likewise
+
+
+@wp.kernel
+def trace_samples(
+    offset: int,
+    scene: Scene,
+    camera: Camera,
+    settings: PathSettings,
+    spp: int,
+    first_index: int,
+    index_count: int,
+    light_samples: int,
+    film: Film,
+    samples: SampleArrays,
+):
+    """One thread owns one pixel: traces its paths, puts what reconstruction leaves alone into `film`, the rest into
+    `samples`. Surfaces that are not diffuse keep their path-traced light.
+    """
+    i = offset + wp.tid()
+    pixel = film.first_pixel + i
+    x = float(pixel % camera.width)
+    y = float(pixel // camera.width)
+    for index in range(first_index, first_index + index_count):
+        k = samples.first_sample + i * spp + index
+        samples.origin[k] = wp.vec3(NO_HIT)
+        samples.hit[k] = wp.vec3(NO_HIT)
+        sampler = make_sampler(settings.seed, pixel, index, settings.sampler)
+        u = sample_2d(sampler, 0)
+        lens = wp.vec2(0.0)
+        if camera.lens_radius > 0.0:
+            lens = sample_2d(sampler, 1)
+        ray = camera_ray(camera, x + u[0], y + u[1], lens)
+        path = PathSample()
+        path.depth = -1.0
+        throughput = wp.vec3(1.0)
+        o = ray.o
+        d = ray.d
+        depth = int(1)
+        going = int(1)
+        while going == 1:
+            hit = closest_hit(scene, o, d)
+            path.closest_hit_rays = path.closest_hit_rays + 1
+            if hit.face < 0:
+                path = add_light(path, depth, wp.cw_mul(throughput, scene.environment))
+                break
+            shape = scene.shapes[scene.face_shapes[hit.face]]
+            s = surface_at(scene, hit, shape)
+            wo = -d
+            if depth == 1:
+                path = add_features(path, s, wo, hit.t)
+            path = add_light(path, depth, wp.cw_mul(throughput, emitted(shape, s.ng, wo)))
+            if depth >= settings.max_depth or depth > MAX_CHAIN:
+                break
+            n = s.n
+            if shape.kind != DIELECTRIC:
+                n = facing_normal(s, wo)
+            delta = shape.kind == DIELECTRIC or shape.kind == MIRROR
+
+            # light sampling, several for the one path: its noise would be left in the picture
+            if scene.light_count > 0 and not delta:
+                for j in range(light_samples):
+                    light_sampler = make_sampler(settings.seed, pixel, index * light_samples + j, settings.sampler)
+                    light = direct_light(
+                        scene,
+                        shape,
+                        s,
+                        n,
+                        wo,
+                        sample_2d(light_sampler, CAMERA_PAIRS),
+                        sample_2d(light_sampler, CAMERA_PAIRS + 2)[0],
+                        1.0 / float(light_samples),
+                    )
+                    path.shadow_rays = path.shadow_rays + light.shadow_rays
+                    path = add_light(path, depth + 1, wp.cw_mul(throughput, light.radiance) / float(light_samples))
+
+            # the secondary ray
+            b = sample(shape, s.albedo, n, wo, sample_2d(sampler, CAMERA_PAIRS + VERTEX_PAIRS * (depth - 1) + 1))
+            if b.weight[0] + b.weight[1] + b.weight[2] <= 0.0:
+                break
+            if b.transmitted == 0 and not reflects(s, wo, b.wi):
+                break
+            o = offset_origin(s.p, s.ng, s.offset, b.wi)
+            d = b.wi
+            if delta:
+                throughput = wp.cw_mul(throughput, b.weight)
+                depth = depth + 1
+            else:
+                going = 0
+                rest = settings
+                rest.max_depth = settings.max_depth - depth
+                light_share = 1.0 / float(light_samples)
+                gathered = trace_path(
+                    scene, rest, sampler, CAMERA_PAIRS + VERTEX_PAIRS * depth, o, d, b.pdf * light_share
+                )
+                path.closest_hit_rays = path.closest_hit_rays + gathered.closest_hit_rays
+                path.shadow_rays = path.shadow_rays + gathered.shadow_rays
+                weight = wp.cw_mul(throughput, b.weight)
+                path = add_light(path, depth + 1, wp.cw_mul(weight, gathered.emission))
+                incident = gathered.direct + gathered.indirect
+                if shape.kind == DIFFUSE:
+                    samples.origin[k] = s.p
+                    samples.origin_normal[k] = n
+                    samples.albedo[k] = weight
+                    samples.radiance[k] = incident
+                    if gathered.depth >= 0.0:
+                        samples.hit[k] = gathered.position
+                        samples.hit_normal[k] = gathered.normal
+                        if samples.throughput.shape[0] > 0:
+                            samples.throughput[k] = gathered.albedo
+                            samples.hit_direct[k] = gathered.direct
+                    else:
+                        samples.hit[k] = d * NO_HIT
+                else:
+                    path = add_light(path, depth + 2, wp.cw_mul(weight, incident))
+        add_sample(film, i, path)

@@ -1,0 +1,391 @@
+"""The splat hierarchy at work: nearest neighbours, shrinking, and the first apparent surface along a ray.
+
+Lehtinen et al. 2012, sections 2.2 to 2.5. Eight splats or boxes are tested together in plain loops that a CPU's
+compiler turns into vector instructions and a GPU runs as they are.
+"""
+
+import warp as wp
+
+from warpgi.kernels.lanes import LANES_HEAD
+
+wp.set_module_options({"enable_backward": False})
+
+MAX_NEIGHBOURS = 32  # the length of the arrays in NEAREST
+
+vec8 = wp.types.vector(length=8, dtype=wp.float32)
+
+
+@wp.struct
+class SplatTree:
+    nodes: wp.array[float]
+    first: wp.array[int]  # a node's first child: a node, or -1 - block; its others follow
+    blocks: wp.array[float]
+    count: int  # splats
+    block_count: int
+
+
+# Squared distance to the k-th neighbour in the metric |d|^2 + stretch (d.n)^2, the sample itself counted, and in
+# Euclid's; samples at the very same place are not neighbours, or they would vanish.
+NEAREST = (
+    LANES_HEAD
+    + """
+    const int block0 = i / 8;
+    const float* q = tree.blocks.data + (size_t)block0 * 80 + i % 8;
+    const float cx = q[0], cy = q[8], cz = q[16], nx = q[24], ny = q[32], nz = q[40];
+    const int want = k - 1;
+    float metric[32], plain[32];
+    int found = 0;
+    float worst = 1.0e30f;
+    int stack[128];
+    float entry[128];
+    int top = 0;
+    int current = -1 - block0;
+    // the three blocks around the sample first: they bound the search
+    int begin = block0 > 0 ? block0 - 1 : 0, end = block0 + 1 < tree.block_count ? block0 + 1 : block0;
+    int next = begin;
+    bool start = true;
+    while (true) {
+        int block = -1;
+        if (start) {
+            block = next++;
+            if (next > end) {
+                start = false;
+                stack[0] = 0;
+                entry[0] = 0.0f;
+                top = 1;
+            }
+        } else {
+            if (top == 0)
+                break;
+            --top;
+            if (entry[top] >= worst)
+                continue;
+            current = stack[top];
+            if (current < 0) {
+                block = -1 - current;
+                if (block >= begin && block <= end)
+                    continue;
+            }
+        }
+        if (block >= 0) {
+            const float* p = tree.blocks.data + (size_t)block * 80;
+            float d2[8], m2[8];
+            int met[8];
+            for (int j = 0; j < 8; ++j) {
+                const float dx = p[j] - cx, dy = p[8 + j] - cy, dz = p[16 + j] - cz;
+                const float along = dx * nx + dy * ny + dz * nz;
+                d2[j] = dx * dx + dy * dy + dz * dz;
+                m2[j] = d2[j] + stretch * along * along;
+                met[j] = (int)((p[48 + j] >= 0.0f) & (d2[j] > 0.0f) & (m2[j] < worst));
+            }
+            unsigned mask = lane_mask(met);
+            while (mask) {
+                const int j = next_lane(mask);
+                if (m2[j] < worst) {
+                    int slot = found < want ? found++ : want - 1;
+                    while (slot > 0 && metric[slot - 1] > m2[j]) {
+                        metric[slot] = metric[slot - 1];
+                        plain[slot] = plain[slot - 1];
+                        --slot;
+                    }
+                    metric[slot] = m2[j];
+                    plain[slot] = d2[j];
+                    if (found == want)
+                        worst = metric[want - 1];
+                }
+            }
+        } else {
+            const float* p = tree.nodes.data + (size_t)current * 48;
+            float d2[8];
+            int met[8];
+            for (int j = 0; j < 8; ++j) {
+                const float dx = wp::max(wp::max(p[j] - cx, cx - p[24 + j]), 0.0f);
+                const float dy = wp::max(wp::max(p[8 + j] - cy, cy - p[32 + j]), 0.0f);
+                const float dz = wp::max(wp::max(p[16 + j] - cz, cz - p[40 + j]), 0.0f);
+                d2[j] = dx * dx + dy * dy + dz * dz;
+                met[j] = (int)(d2[j] < worst);
+            }
+            const int first = tree.first.data[current];
+            const int base = top;
+            unsigned mask = lane_mask(met);
+            while (mask) {
+                const int j = next_lane(mask);
+                int slot = top++;
+                while (slot > base && entry[slot - 1] < d2[j]) {
+                    entry[slot] = entry[slot - 1];
+                    stack[slot] = stack[slot - 1];
+                    --slot;
+                }
+                entry[slot] = d2[j];
+                stack[slot] = first >= 0 ? first + j : first - j;
+            }
+        }
+    }
+    return found > 0 ? plain[found - 1] : -1.0f;
+"""
+)
+
+
+@wp.func_native(NEAREST)
+def nearest_distance2(tree: SplatTree, i: int, k: int, stretch: float) -> float: ...
+
+
+# Walks the boxes along a ray and hands each block it meets to CODE, nearest first, as long as `limit` is not passed.
+WALK_HEAD = (
+    LANES_HEAD
+    + """
+    const float rx = 1.0f / (wp::abs(d[0]) < 1.0e-30f ? 1.0e-30f : d[0]);
+    const float ry = 1.0f / (wp::abs(d[1]) < 1.0e-30f ? 1.0e-30f : d[1]);
+    const float rz = 1.0f / (wp::abs(d[2]) < 1.0e-30f ? 1.0e-30f : d[2]);
+    const float ox = o[0] * rx, oy = o[1] * ry, oz = o[2] * rz;
+    const int ax = rx < 0.0f ? 24 : 0, ay = ry < 0.0f ? 32 : 8, az = rz < 0.0f ? 40 : 16;
+    const int bx = 24 - ax, by = 40 - ay, bz = 56 - az;
+    int stack[128];
+    float entry[128];
+"""
+)
+WALK_LOOP = """
+    int top = 1;
+    stack[0] = 0;
+    entry[0] = 0.0f;
+    while (top > 0) {
+        --top;
+        if (entry[top] >= limit)
+            continue;
+        const int current = stack[top];
+        if (current >= 0) {
+            const float* p = tree.nodes.data + (size_t)current * 48;
+            float near[8];
+            int met[8];
+            for (int k = 0; k < 8; ++k) {
+                const float enter = wp::max(
+                    wp::max(p[ax + k] * rx - ox, p[ay + k] * ry - oy), wp::max(p[az + k] * rz - oz, 0.0f));
+                const float leave = wp::min(
+                    wp::min(p[bx + k] * rx - ox, p[by + k] * ry - oy), wp::min(p[bz + k] * rz - oz, limit));
+                near[k] = enter;
+                met[k] = enter <= leave * 1.0000004f ? 1 : 0;
+            }
+            const int first = tree.first.data[current];
+            const int base = top;
+            unsigned mask = lane_mask(met);
+            while (mask) {
+                const int k = next_lane(mask);
+                int slot = top++;
+                while (slot > base && entry[slot - 1] < near[k]) {
+                    entry[slot] = entry[slot - 1];
+                    stack[slot] = stack[slot - 1];
+                    --slot;
+                }
+                entry[slot] = near[k];
+                stack[slot] = first >= 0 ? first + k : first - k;
+            }
+        } else {
+            const int block = -1 - current;
+            const float* p = tree.blocks.data + (size_t)block * 80;
+"""
+WALK_TAIL = """
+        }
+    }
+"""
+
+# Shrinking, section 2.3.1: a splat that an input ray crosses between its ends is no larger than the crossing's
+# distance. Radii are read from the tree and the new ones go to a slot of their own, where only the least counts, so
+# that neither the order of rays nor the number of threads matters.
+SHRINK = (
+    WALK_HEAD
+    + "    const float limit = length - margin;\n    int crossed = 0;\n"
+    + WALK_LOOP
+    + """
+            float e2[8];
+            int met[8];
+            for (int k = 0; k < 8; ++k) {
+                const float dx = p[k] - o[0], dy = p[8 + k] - o[1], dz = p[16 + k] - o[2];
+                const float nx = p[24 + k], ny = p[32 + k], nz = p[40 + k];
+                const float t = (dx * nx + dy * ny + dz * nz) / (nx * d[0] + ny * d[1] + nz * d[2]);
+                const float ex = t * d[0] - dx, ey = t * d[1] - dy, ez = t * d[2] - dz;
+                e2[k] = ex * ex + ey * ey + ez * ez;
+                met[k] = (int)((e2[k] < p[48 + k]) & (t > margin) & (t < limit));
+            }
+            unsigned mask = lane_mask(met);
+            while (mask) {
+                const int k = next_lane(mask);
+                if (block * 8 + k != own) {
+                    ++crossed;
+                    if (slot >= 0)
+                        wp::atomic_min(radius2, slot * tree.count + block * 8 + k, e2[k]);
+                }
+            }
+"""
+    + WALK_TAIL
+    + "    return crossed;\n"
+)
+
+
+@wp.func_native(SHRINK)
+def shrink_crossed(
+    tree: SplatTree,
+    o: wp.vec3,
+    d: wp.vec3,
+    length: float,
+    margin: float,
+    own: int,
+    slot: int,
+    radius2: wp.array[float],
+) -> int: ...
+
+
+# The first apparent surface along a ray, section 2.3.2: the gathered splats in front of the nearest conflict. A pair
+# conflicts where its event line meets the st plane in the positive, or in the negative, half-spaces of both (with the
+# authors' erratum); that is a b depth_i depth_j > 0 for a = (h_j - h_i).n_i and b = (h_j - h_i).n_j.
+# Returns radiance times weight (3), weight, weight of splats nearer than `reach`, splats in the surface, and whether
+# the gather was cut short and how many undersampled surfaces were passed through.
+SURFACE = (
+    WALK_HEAD
+    + """
+    float hx[72], hy[72], hz[72], gx[72], gy[72], gz[72], depth[72], t_of[72], e_of[72];
+    for (int j = 0; j < 72; ++j)
+        hx[j] = hy[j] = hz[j] = gx[j] = gy[j] = gz[j] = depth[j] = 0.0f;
+    const float slack_noise2 = 16.0f * noise * noise;
+    int place[64];
+    int passed[16];
+    int passed_count = 0, surfaces_passed = 0, cut = 0;
+    int size = 0, inside = 0;
+    float limit = 1.0e30f;
+    while (true) {
+        size = 0;
+        limit = 1.0e30f;
+"""
+    + WALK_LOOP
+    + """
+            float t[8], e2[8], along[8], facing[8];
+            int met[8];
+            for (int k = 0; k < 8; ++k) {
+                const float dx = p[k] - o[0], dy = p[8 + k] - o[1], dz = p[16 + k] - o[2];
+                const float nx = p[24 + k], ny = p[32 + k], nz = p[40 + k], r2 = p[48 + k];
+                const float plane = dx * nx + dy * ny + dz * nz;
+                facing[k] = nx * d[0] + ny * d[1] + nz * d[2];
+                along[k] = dx * d[0] + dy * d[1] + dz * d[2];
+                t[k] = plane / facing[k];
+                const float ex = t[k] * d[0] - dx, ey = t[k] * d[1] - dy, ez = t[k] * d[2] - dz;
+                e2[k] = ex * ex + ey * ey + ez * ez;
+                // a splat in whose plane the ray starts is the receiver's own surface; one seen from behind and
+                // nearer than its radius is the same surface where it bends away
+                const bool own = plane * plane <= 1.0e-6f * r2 + noise * noise;
+                const bool bent = (facing[k] > 0.0f) & (along[k] * wp::abs(along[k]) < r2);
+                met[k] = (int)((e2[k] < r2) & (t[k] > 0.0f) & (t[k] < limit) & !own & !bent);
+            }
+            unsigned mask = lane_mask(met);
+            while (mask) {
+                const int k = next_lane(mask);
+                if (t[k] >= limit)
+                    continue;
+                const int splat = block * 8 + k;
+                bool skip = false;
+                for (int j = 0; j < passed_count; ++j)
+                    skip = skip | (passed[j] == splat);
+                if (skip)
+                    continue;
+                if (size == 64) {
+                    // forget what lies behind the limit; if nothing does, the farthest ends the surface
+                    int farthest = 0;
+                    for (int j = 1; j < 64; ++j)
+                        farthest = t_of[j] > t_of[farthest] ? j : farthest;
+                    if (t_of[farthest] < limit) {
+                        cut = 1;
+                        limit = t_of[farthest];
+                        if (t[k] >= limit)
+                            continue;
+                    }
+                    int kept = 0;
+                    for (int j = 0; j < 64; ++j) {
+                        if (t_of[j] < limit) {
+                            hx[kept] = hx[j]; hy[kept] = hy[j]; hz[kept] = hz[j];
+                            gx[kept] = gx[j]; gy[kept] = gy[j]; gz[kept] = gz[j];
+                            depth[kept] = depth[j]; t_of[kept] = t_of[j]; e_of[kept] = e_of[j];
+                            place[kept] = place[j];
+                            ++kept;
+                        }
+                    }
+                    size = kept;
+                }
+                const float px = p[k], py = p[8 + k], pz = p[16 + k];
+                const float nx = p[24 + k], ny = p[32 + k], nz = p[40 + k];
+                const float far = along[k];
+                // eight at a time; lanes past the end hold old samples whose t is put beyond any limit
+                float first_conflict[8];
+                for (int c = 0; c < 8; ++c)
+                    first_conflict[c] = limit;
+                if (size % 8 == 0) {
+                    for (int c = 0; c < 8; ++c)
+                        t_of[size + c] = 1.0e30f;
+                }
+                for (int j = 0; j < size; j += 8) {
+                    for (int c = 0; c < 8; ++c) {
+                        const float dx = px - hx[j + c], dy = py - hy[j + c], dz = pz - hz[j + c];
+                        const float a = dx * gx[j + c] + dy * gy[j + c] + dz * gz[j + c];
+                        const float b = dx * nx + dy * ny + dz * nz;
+                        const float slack2 = 1.0e-4f * (dx * dx + dy * dy + dz * dz) + slack_noise2;
+                        const bool conflict =
+                            (a * b * (depth[j + c] * far) > 0.0f) & (a * a > slack2) & (b * b > slack2);
+                        const float both = wp::max(t_of[j + c], t[k]);
+                        first_conflict[c] = wp::min(first_conflict[c], conflict ? both : 1.0e30f);
+                    }
+                }
+                for (int c = 0; c < 8; ++c)
+                    limit = wp::min(limit, first_conflict[c]);
+                hx[size] = px; hy[size] = py; hz[size] = pz;
+                gx[size] = nx; gy[size] = ny; gz[size] = nz;
+                depth[size] = far; t_of[size] = t[k];
+                e_of[size] = e2[k] / p[48 + k];
+                place[size] = facing[k] < 0.0f ? splat : -1 - splat;
+                ++size;
+            }
+"""
+    + WALK_TAIL
+    + """
+        // one or two splats before something else are too few to trust their size (section 2.5)
+        inside = 0;
+        float closest = 1.0f;
+        for (int j = 0; j < size; ++j) {
+            if (t_of[j] < limit) {
+                ++inside;
+                closest = wp::min(closest, e_of[j]);
+            }
+        }
+        if (inside == 0 || inside > 2 || limit >= 1.0e30f || passed_count + inside > 16)
+            break;
+        if (closest <= (inside == 1 ? 0.25f : 0.4444444f))
+            break;
+        for (int j = 0; j < size; ++j) {
+            if (t_of[j] < limit)
+                passed[passed_count++] = place[j] >= 0 ? place[j] : -1 - place[j];
+        }
+        ++surfaces_passed;
+    }
+    bool any_front = false;
+    for (int j = 0; j < size; ++j)
+        any_front = any_front | ((t_of[j] < limit) & (place[j] >= 0));
+    float r = 0.0f, g = 0.0f, b = 0.0f, weight = 0.0f, within = 0.0f;
+    for (int j = 0; j < size; ++j) {
+        // splats seen from behind give radiance only where all of the surface is (section 2.5)
+        if (t_of[j] < limit && (place[j] >= 0) == any_front) {
+            const int splat = place[j] >= 0 ? place[j] : -1 - place[j];
+            const float* q = tree.blocks.data + (size_t)(splat / 8) * 80 + splat % 8;
+            const float w = 1.0f - wp::sqrt(e_of[j]);
+            r += w * q[56];
+            g += w * q[64];
+            b += w * q[72];
+            weight += w;
+            within += depth[j] < reach ? w : 0.0f;
+        }
+    }
+    wp::vec_t<8, wp::float32> result;
+    result[0] = r; result[1] = g; result[2] = b; result[3] = weight; result[4] = within;
+    result[5] = (float)inside; result[6] = (float)cut; result[7] = (float)surfaces_passed;
+    return result;
+"""
+)
+
+
+@wp.func_native(SURFACE)
+def first_surface(tree: SplatTree, o: wp.vec3, d: wp.vec3, noise: float, reach: float) -> vec8: ...

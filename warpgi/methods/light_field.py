@@ -1,0 +1,123 @@
+"""Light-field reconstruction (Lehtinen et al. 2012): hundreds of samples' worth of indirect light from a few."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import warp as wp
+
+from warpgi import checks
+from warpgi.film import Film
+from warpgi.job import Job
+from warpgi.kernels.light_field import add_reflected
+from warpgi.kernels.samples import trace_samples
+from warpgi.kernels.splats import MAX_NEIGHBOURS
+from warpgi.methods.path import NEVER, Sampler
+from warpgi.reconstruction import BYTES_PER_SAMPLE, KERNELS, Preprocessing, Reconstruction
+from warpgi.sampling import SAMPLE_BYTES, trace_sample_buffer
+
+
+@dataclass(frozen=True, kw_only=True)
+class LightField:
+    """Indirect light reconstructed from a few path-traced samples per pixel (Lehtinen et al. 2012).
+
+    Reconstructs what diffuse surfaces reflect; what others do keeps its path-traced light. `gi.reconstruct` uses it on
+    a sample buffer alone, where the fields that say how samples are traced mean nothing.
+
+    Raises:
+        TypeError, ValueError: a setting is out of range.
+    """
+
+    spp: int = 8
+    """Input paths per pixel; more of them resolve finer detail of geometry and light."""
+    rays: int = 256
+    """Reconstruction rays per pixel, shared out over its samples; noise falls and time grows with it."""
+    neighbours: int = 12
+    """Samples that lie within a splat's radius at first, itself counted, in [2, 32]; more is smoother."""
+    alpha: float = 3.0
+    """Factor by which distances along a splat's normal count for more, 1 or above."""
+    margin: float = 1e-3
+    """Part of an input ray at either end in which the splats that it crosses do not shrink, in [0, 0.5)."""
+    recursive: int = 0
+    """Times that the samples' own light is reconstructed first; cures artefacts of noisy samples in corners."""
+    recursive_rays: int = 16
+    """Reconstruction rays for each sample in that step."""
+    light_samples: int = 4
+    """Shadow rays to lights from each primary hit, which make the direct light."""
+    max_depth: int | None = None
+    """Longest path in segments; None is unlimited."""
+    roulette_depth: int | None = 5
+    """Segments after which Russian roulette may end an input path; None switches it off and needs a `max_depth`."""
+    sampler: Sampler = Sampler.SOBOL
+    """Where the input paths' random numbers come from."""
+
+    def __post_init__(self) -> None:
+        checks.count("spp", self.spp)
+        checks.count("rays", self.rays)
+        checks.count("neighbours", self.neighbours, 2, MAX_NEIGHBOURS)
+        checks.number("alpha", self.alpha, 1.0)
+        checks.number("margin", self.margin, 0.0, 0.499)
+        checks.count("recursive", self.recursive, 0)
+        checks.count("recursive_rays", self.recursive_rays)
+        checks.count("light_samples", self.light_samples)
+        if self.max_depth is not None:
+            checks.count("max_depth", self.max_depth)
+        if self.roulette_depth is not None:
+            checks.count("roulette_depth", self.roulette_depth)
+        if self.max_depth is None and self.roulette_depth is None:
+            raise ValueError("max_depth and roulette_depth are both None, expected one of them, or paths never end")
+        if not isinstance(self.sampler, Sampler):
+            raise TypeError(f"sampler is {self.sampler!r}, expected a Sampler")
+
+    @property
+    def kernels(self) -> tuple[wp.Kernel, ...]:
+        """What it launches."""
+        return (trace_samples, *KERNELS)
+
+    @property
+    def preprocessing(self) -> Preprocessing:
+        """How splats are sized."""
+        return Preprocessing(self.neighbours, self.alpha, self.margin)
+
+    def passes(self, spp: int | None = None) -> tuple[int, str]:
+        """Reconstruction rays for each primary hit, at `spp` of them in a pixel, and what to call them."""
+        return max(1, round(self.rays / (spp or self.spp))), "rays per hit"
+
+    def device_bytes(self, size: tuple[int, int]) -> int:
+        """Device memory it takes beside scene and film."""
+        return size[0] * size[1] * self.spp * (SAMPLE_BYTES + BYTES_PER_SAMPLE)
+
+    def prepare(self, job: Job, film: Film) -> Reconstruction:
+        """Traces the input, with what is not reconstructed going to the film, and makes splats of it."""
+        samples = trace_sample_buffer(
+            job,
+            film,
+            self.spp,
+            self.light_samples,
+            self.max_depth or NEVER,
+            self.roulette_depth or NEVER,
+            self.sampler,
+            with_hit_light=self.recursive > 0,
+        )
+        return Reconstruction(
+            samples,
+            job.device,
+            self.preprocessing,
+            job.seed,
+            recursions=self.recursive,
+            recursive_rays=self.recursive_rays,
+        )
+
+    def estimate(self, job: Job, state: Reconstruction, film: Film, first: int, count: int) -> None:
+        """Sends `count` reconstruction rays from every primary hit."""
+        state.gather(first, count, self.passes()[0])
+
+    def finish(self, job: Job, state: Reconstruction, film: Film) -> None:
+        """Adds the reconstructed light to the film's indirect layer."""
+        reflected = state.reflected()
+        for band in film.bands:
+            job.device.launch(add_reflected, len(band), [film.load(band), reflected, self.spp])
+
+    def counts(self, state: Reconstruction) -> dict[str, int]:
+        """Reconstruction rays, and what was dropped, cut short or without support."""
+        return state.all_counts()

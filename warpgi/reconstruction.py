@@ -1,0 +1,200 @@
+"""Light-field reconstruction on a device: from a sample buffer to the light at its primary hits.
+
+Lehtinen et al. 2012, "Reconstructing the Indirect Light Field for Global Illumination", sections 2 and 4. It never
+sees the scene.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warpgi.device import Device
+from warpgi.kernels import bvh
+from warpgi.kernels import light_field as kernels
+from warpgi.samples import SampleBuffer
+from warpgi.splat_tree import SplatTree
+
+# Position rounding in units of float32's spacing at the largest coordinate: positions come from a few operations.
+NOISE_ULPS = 4.0 * 2.0**-24
+
+# Escaped rays for each texel of the map that answers for the sky, and the map's largest side.
+SKY_RAYS_PER_TEXEL = 8
+SKY_MAX_SIZE = 64
+
+# Device bytes a sample: five vectors, the splat in its block with nodes, order and sort keys, sums and counts.
+BYTES_PER_SAMPLE = 5 * 12 + 48 + 36 + 40
+
+
+@dataclass(frozen=True)
+class Preprocessing:
+    """How splats are sized; the sections are of Lehtinen et al. 2012."""
+
+    neighbours: int
+    """k of the k-NN search, the sample counted (2.2)."""
+    alpha: float
+    """Stretch of distances along the normal (2.2)."""
+    margin: float
+    """Part of an input ray's length, at either end, in which a crossed splat is not shrunk (2.3.1)."""
+
+
+class Reconstruction:
+    """Splats made from samples, and sums of what reconstruction rays found for each receiver.
+
+    Args:
+        samples: the input; its unusable samples are left out and counted.
+        device: where it computes.
+        preprocessing: how splats are sized.
+        seed: which reconstruction rays.
+        reach: distance within which a surface counts as near, for ambient occlusion.
+
+    Raises:
+        ValueError: the samples hold no secondary rays, or do not fit into the device's memory limit.
+    """
+
+    def __init__(
+        self,
+        samples: SampleBuffer,
+        device: Device,
+        preprocessing: Preprocessing,
+        seed: int,
+        reach: float = np.inf,
+        recursions: int = 0,
+        recursive_rays: int = 16,
+    ) -> None:
+        if not samples.has_secondary_rays:
+            raise ValueError("samples hold no secondary rays, expected a sample buffer of format 2.0 or newer")
+        if recursions and (samples.throughput is None or samples.hit_direct is None):
+            raise ValueError("samples lack throughput or hit_direct, expected both for recursive filtering")
+        need = len(samples) * BYTES_PER_SAMPLE
+        if need > device.memory_limit:
+            raise ValueError(f"memory_limit is {device.memory_limit} bytes, expected {need} for {len(samples)} samples")
+        self.samples, self.device, self.seed = samples, device, seed
+        self.reach = min(float(reach), 1e30)
+        state = samples.checked
+        splats = np.flatnonzero(state.is_splat).astype(np.int32)
+        self.primary = np.flatnonzero(state.is_primary).astype(np.int32)
+        self._upload(splats)
+        self.tree = SplatTree(device, self._hits, self._hit_normals, self._radiance, splats, self.noise)
+        rays = kernels.Rays()
+        rays.origins, rays.hits, rays.order = self._origins, self._hits, self.tree.order
+        self.rays, self.preprocessing = rays, preprocessing
+        self.tree.size_by_neighbours(rays, preprocessing.neighbours, preprocessing.alpha)
+        self.tree.shrink(rays, preprocessing.margin)
+        self.sky = self._sky(np.flatnonzero(state.is_escaped))
+        self.counts = {name: count for name, count in state.counts.items() if name != "primary_missed"}
+        self.counts |= {"splats": len(splats), "reconstruction_rays": 0}
+        for _ in range(recursions):
+            self._relight(splats, recursive_rays)
+        self._receivers = self._make_receivers(self.primary, self._origins, self._origin_normals)
+        self._gathered = self._make_gathered(len(self.primary))
+        self.rays_done = 0
+
+    def gather(self, first: int, count: int, each: int) -> None:
+        """Sends rays `first` to `first + count - 1` out of `each` from every receiver, and adds up what they find."""
+        self._trace(self._receivers, self._gathered, len(self.primary), first, count, each)
+        self.rays_done += count
+
+    def reflected(self) -> wp.array:
+        """Indirect light that each sample's primary hit reflects, vec3 on the device, one for each sample."""
+        albedo = self.device.array(self.samples.albedo, wp.vec3)
+        result = self.device.zeros(len(self.samples), wp.vec3)
+        inputs = [self._receivers, self._gathered, self.rays_done, albedo]
+        self.device.launch(kernels.reflect, len(self.primary), inputs, [result])
+        return result
+
+    def near(self) -> np.ndarray:
+        """Share of each sample's rays that met a surface within reach, shape (N,); 0 without a primary hit."""
+        result = np.zeros(len(self.samples), np.float32)
+        result[self.primary] = self._gathered.near.numpy() / max(self.rays_done, 1)
+        return result
+
+    def all_counts(self) -> dict[str, int]:
+        """Rays so far, and what was dropped, cut short or without support."""
+        found = self._gathered.counts.numpy().sum(axis=0, dtype=np.int64)
+        names = ("missing_support", "sky_rays", "cut_gathers", "undersampled_surfaces")
+        return self.counts | dict(zip(names, found.tolist(), strict=True))
+
+    def _upload(self, splats: np.ndarray) -> None:
+        """Positions relative to the splats' centre, so that float32 serves samples far away."""
+        samples, device = self.samples, self.device
+        used = samples.hit[splats] if len(splats) else np.zeros((1, 3), np.float32)
+        low, high = used.min(axis=0), used.max(axis=0)
+        centre = 0.5 * (low + high)
+        self.noise = NOISE_ULPS * max(float(np.abs(low).max()), float(np.abs(high).max()), 1e-30)
+        with np.errstate(invalid="ignore", over="ignore"):
+            self._origins = device.array(samples.origin - centre, wp.vec3)
+            self._hits = device.array(samples.hit - centre, wp.vec3)
+        self._origin_normals = device.array(samples.unit_origin_normal, wp.vec3)
+        self._hit_normals = device.array(samples.unit_hit_normal, wp.vec3)
+        self._radiance = device.array(samples.radiance, wp.vec3)
+
+    def _sky(self, escaped: np.ndarray) -> kernels.Sky:
+        """Mean radiance of escaped rays by direction; texels that no ray met take the mean of all."""
+        sky = kernels.Sky()
+        size = 0
+        texels = np.zeros((0, 3), np.float32)
+        if len(escaped):
+            radiance = self.samples.radiance[escaped].astype(np.float64)
+            varies = bool(np.ptp(radiance, axis=0).any())
+            size = int(np.clip(np.sqrt(len(escaped) / SKY_RAYS_PER_TEXEL), 1, SKY_MAX_SIZE)) if varies else 1
+            place = _octahedral(self.samples.direction[escaped], size)
+            count = np.bincount(place, minlength=size * size)
+            sums = [np.bincount(place, radiance[:, c], size * size) for c in range(3)]
+            mean = radiance.mean(axis=0)
+            filled = np.stack(sums, axis=-1) / np.maximum(count, 1)[:, None]
+            texels = np.where(count[:, None] > 0, filled, mean).astype(np.float32)
+        sky.size, sky.radiance = size, self.device.array(texels, wp.vec3)
+        return sky
+
+    def _make_receivers(self, sample: np.ndarray, origins: wp.array, normals: wp.array) -> kernels.Receivers:
+        receivers = kernels.Receivers()
+        receivers.sample = self.device.array(sample, int)
+        receivers.origins, receivers.normals, receivers.spp = origins, normals, self.samples.spp
+        pixels = places = np.zeros(0, np.int32)
+        if self.samples.pixel is not None:
+            pixels = self.samples.pixel
+            first = np.searchsorted(pixels, pixels, side="left")
+            places = (np.arange(len(pixels)) - first).astype(np.int32)
+        receivers.pixels, receivers.places = self.device.array(pixels, int), self.device.array(places, int)
+        return receivers
+
+    def _make_gathered(self, count: int) -> kernels.Gathered:
+        gathered = kernels.Gathered()
+        gathered.radiance = self.device.zeros(count, wp.vec3)
+        gathered.near = self.device.zeros(count, float)
+        gathered.counts = self.device.zeros(count, wp.vec4i)
+        return gathered
+
+    def _trace(
+        self, receivers: kernels.Receivers, gathered: kernels.Gathered, size: int, first: int, count: int, each: int
+    ) -> None:
+        inputs = [self.tree.struct, self.sky, receivers, each, first, count, self.seed, self.noise, self.reach]
+        self.device.launch(kernels.reconstruct, size, inputs, [gathered])
+        self.counts["reconstruction_rays"] += size * count
+
+    def _relight(self, splats: np.ndarray, rays: int) -> None:
+        """Recursive filtering (section 4): the splats' own light, reconstructed, replaces what one path brought."""
+        device, samples = self.device, self.samples
+        receivers = self._make_receivers(splats, self._hits, self._hit_normals)
+        gathered = self._make_gathered(len(splats))
+        self._trace(receivers, gathered, len(splats), 0, rays, rays)
+        parts = [device.array(part, wp.vec3) for part in (samples.hit_direct, samples.throughput)]
+        device.launch(kernels.relight_splats, len(splats), [receivers, gathered, rays, *parts], [self._radiance])
+        self.tree.set_radiance(self._radiance)
+
+
+KERNELS = (kernels.reconstruct, bvh.fill_blocks)
+
+
+def _octahedral(direction: np.ndarray, size: int) -> np.ndarray:
+    """Texel of each direction on the map that `kernels.light_field` reads, shape (N,)."""
+    d = direction / np.abs(direction).sum(axis=1, keepdims=True)
+    u, v = d[:, 0], d[:, 1]
+    below = d[:, 2] < 0.0
+    fold = [(1.0 - np.abs(b)) * np.where(a >= 0.0, 1.0, -1.0) for a, b in ((u, v), (v, u))]
+    u, v = np.where(below, fold[0], u), np.where(below, fold[1], v)
+    x, y = (np.clip(((0.5 * a + 0.5) * size).astype(np.int64), 0, size - 1) for a in (u, v))
+    return y * size + x

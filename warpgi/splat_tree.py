@@ -1,0 +1,133 @@
+"""The splat hierarchy: order, levels and boxes of `kernels.bvh`, sizes of `kernels.light_field`."""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from warpgi.device import Device
+from warpgi.kernels import bvh
+from warpgi.kernels import light_field as kernels
+from warpgi.kernels.splats import SplatTree as SplatTreeStruct
+
+LANES = int(bvh.LANES)
+
+
+class SplatTree:
+    """Splats in a tree of eight children a node.
+
+    Args:
+        device: where it lives.
+        hits, normals, radiance: of all samples, vec3 arrays on the device.
+        splats: which samples are splats, int array on the host, at least one.
+        noise: rounding of the positions.
+
+    Attributes:
+        struct: what kernels see.
+        order: place in the tree -> sample, on the device.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        hits: wp.array,
+        normals: wp.array,
+        radiance: wp.array,
+        splats: np.ndarray,
+        noise: float,
+    ) -> None:
+        self.device = device
+        self.noise = noise
+        self.count = len(splats)
+        self.block_count = -(-self.count // LANES)
+        self.order = self._hilbert_order(hits, splats)
+        self._lay_out_levels()
+        struct = SplatTreeStruct()
+        struct.nodes = device.zeros(self.node_count * int(bvh.NODE_STRIDE), float)
+        struct.first = device.array(self._first, int)
+        struct.blocks = device.zeros(self.block_count * int(bvh.BLOCK_STRIDE), float)
+        struct.count, struct.block_count = self.count, self.block_count
+        self.struct = struct
+        inputs = [hits, normals, radiance, self.order, self.count]
+        device.launch(bvh.fill_blocks, self.block_count * LANES, inputs, [struct.blocks])
+        self.refit()
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes on the device."""
+        arrays = (self.struct.nodes, self.struct.first, self.struct.blocks, self.order)
+        return sum(array.capacity for array in arrays)
+
+    def _hilbert_order(self, hits: wp.array, splats: np.ndarray) -> wp.array:
+        device, count = self.device, self.count
+        source = device.array(splats, int)
+        # the bounds of what is a splat, found on the host: the samples came from there
+        points = hits.numpy()[splats]
+        low, high = points.min(axis=0), points.max(axis=0)
+        size = max(float((high - low).max()), 1e-30)
+        keys, values = device.zeros(2 * count, int), device.zeros(2 * count, int)
+        inputs = [hits, source, wp.vec3(*low.tolist()), 1.0 / size]
+        device.launch(bvh.order_keys, count, inputs, [keys, values])
+        wp.utils.radix_sort_pairs(keys, values, count)
+        return values[:count].contiguous()
+
+    def _lay_out_levels(self) -> None:
+        """Numbers nodes from the root down; a level has an eighth of the nodes of the one below."""
+        sizes = [-(-self.block_count // LANES)]
+        while sizes[-1] > 1:
+            sizes.append(-(-sizes[-1] // LANES))
+        starts = np.zeros(len(sizes), dtype=np.int64)
+        for level in reversed(range(len(sizes) - 1)):
+            starts[level] = starts[level + 1] + sizes[level + 1]
+        self.levels = [(int(start), size) for start, size in zip(starts, sizes, strict=True)]
+        self.node_count = sum(sizes)
+        self._first = np.empty(self.node_count, np.int32)
+        for level, (start, size) in enumerate(self.levels):
+            child = LANES * np.arange(size, dtype=np.int32)
+            self._first[start : start + size] = -1 - child if level == 0 else self.levels[level - 1][0] + child
+
+    def refit(self) -> None:
+        """Boxes from the splats' present sizes, level by level."""
+        start, size = self.levels[0]
+        blocks, nodes = self.struct.blocks, self.struct.nodes
+        self.device.launch(bvh.fit_leaves, size, [blocks, self.block_count, start, self.noise], [nodes])
+        for (start, size), (below, count_below) in zip(self.levels[1:], self.levels, strict=False):
+            self.device.launch(bvh.fit_level, size, [start, below, count_below], [nodes])
+
+    def size_by_neighbours(self, rays: kernels.Rays, k: int, alpha: float) -> None:
+        """Radii from the k-th nearest neighbour (Lehtinen et al. 2012, section 2.2)."""
+        radius2 = self.device.zeros(self.count, float)
+        # |d + (alpha - 1) (d.n) n|^2 = |d|^2 + (alpha^2 - 1) (d.n)^2
+        self.device.launch(kernels.size_splats, self.count, [self.struct, rays, k, alpha * alpha - 1.0], [radius2])
+        self._set_radii(radius2, 1)
+
+    def shrink(self, rays: kernels.Rays, margin: float) -> None:
+        """Shrinks what input rays cross (section 2.3.1); the same for any number of threads."""
+        slots = self.device.slots
+        radius2 = wp.full(slots * self.count, 3.0e38, dtype=float, device=self.device.warp)
+        own = radius2[: self.count]
+        self.device.launch(bvh.read_radii, self.count, [self.struct.blocks], [own])
+        inputs = [self.struct, rays, margin, self.noise]
+        self.device.launch(kernels.shrink_splats, self.count, inputs, [radius2], with_slot=True)
+        self._set_radii(radius2, slots)
+
+    def count_crossed(self, rays: kernels.Rays, margin: float) -> int:
+        """Splats that input rays cross before their ends, over all rays: 0 after shrinking."""
+        crossed, none = self.device.zeros(self.count, int), self.device.zeros(1, float)
+        inputs = [self.struct, rays, margin, self.noise, none]
+        self.device.launch(kernels.count_crossed, self.count, inputs, [crossed])
+        return int(crossed.numpy().sum(dtype=np.int64))
+
+    def radii(self) -> np.ndarray:
+        """Radius of each splat in tree order, shape (count,)."""
+        radius2 = self.device.zeros(self.count, float)
+        self.device.launch(bvh.read_radii, self.count, [self.struct.blocks], [radius2])
+        return np.sqrt(radius2.numpy())
+
+    def set_radiance(self, radiance: wp.array) -> None:
+        """Takes the splats' radiance anew from that of all samples."""
+        self.device.launch(bvh.fill_radiance, self.count, [radiance, self.order], [self.struct.blocks])
+
+    def _set_radii(self, radius2: wp.array, slots: int) -> None:
+        self.device.launch(bvh.fill_radii, self.count, [radius2, slots, self.count], [self.struct.blocks])
+        self.refit()
