@@ -277,9 +277,8 @@ def render_picture(
     device = on_device.device
     job = Job(on_device, on_device.camera(size), size, seed, device)
     film = Film(size, device, device.memory_limit - on_device.nbytes)
-    state = method.prepare(job)
-    for band in film.bands:
-        method.estimate(job, state, film.load(band), 0, method.spp)
+    state = method.prepare(job, film)
+    method.estimate(job, state, film, 0, method.spp)
     layers = film.layers(on_device.centre)
     counts = film.counts()
     image = layers["emission"] + layers["direct"] + layers["indirect"]

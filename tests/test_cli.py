@@ -174,7 +174,7 @@ def test_bar_and_ctrl_c(tmp_path):
     threading.Thread(target=drain, args=(terminal,), daemon=True).start()
     output, _ = process.communicate(timeout=60.0)
     assert process.returncode == INTERRUPTED
-    held = int(re.search(r"the picture holds (\d+) of 10000000 samples per pixel", output)[1])
+    held = int(re.search(r"the picture holds (\d+) of 10000000 spp", output)[1])
     assert gi.Render.load(out).spp == held > 0
 
 

@@ -170,7 +170,7 @@ def test_direct_light_of_a_rectangle(two_sided):
 
 
 def test_point_spot_and_distant_light():
-    """A floor's radiance is albedo / pi times I cos / d^2, with the cone's fall-off of KHR_lights_punctual, or E cos."""
+    """A floor's radiance is albedo / pi times I cos / d^2, with the cone of KHR_lights_punctual, or E cos."""
     floor = gi.Shape([(-9, 0, -9), (-9, 0, 9), (9, 0, 9), (9, 0, -9)], [(0, 1, 2), (0, 2, 3)], gi.Diffuse(0.5))
     camera = gi.Camera((0.0, 2.0, 0.0), (0.0, 0.0, 0.0), up=(0, 0, -1), fov=60)
     source = np.array((0.5, 1.5, -0.25))

@@ -124,7 +124,7 @@ def provenance(method: Method, seed: int, device: Device) -> dict[str, Any]:
     """Fields of a `Render` that say what made it."""
     return {
         "method": next(name for name, kind in METHODS.items() if isinstance(method, kind)),
-        "settings": dataclasses.asdict(method),
+        "settings": dataclasses.asdict(method),  # type: ignore[call-overload]
         "seed": seed,
         "device": device.name,
         "versions": versions(),

@@ -157,7 +157,7 @@ class SampleBuffer:
     def _checked_pixel(self) -> np.ndarray:
         if self.spp:
             raise ValueError(f"spp is {self.spp}, expected 0 where pixel says where each sample lies")
-        pixel = _array("pixel", self.pixel, (np.size(self.pixel),), np.int32, "one index per sample")
+        pixel = _array("pixel", self.pixel, None, np.int32, "one index per sample")
         if len(pixel) and (pixel[0] < 0 or pixel[-1] >= self.width * self.height):
             raise ValueError(
                 f"pixel runs from {pixel[0]} to {pixel[-1]}, expected values from 0 to {self.width * self.height - 1}"
@@ -195,6 +195,7 @@ class SampleBuffer:
         return (np.arange(len(self)) // max(self.spp, 1)).astype(np.int32)
 
     @property
+    @np.errstate(invalid="ignore")
     def kappa(self) -> np.ndarray | None:
         """Concentration of the von Mises-Fisher lobe, 4 sqrt(bandwidth), shape (N,); 0 is diffuse; None: all are."""
         return None if self.bandwidth is None else 4.0 * np.sqrt(np.maximum(self.bandwidth, np.float32(0.0)))
@@ -210,15 +211,16 @@ class SampleBuffer:
         return unit(self.hit_normal)
 
     @property
+    @np.errstate(invalid="ignore")
     def direction(self) -> np.ndarray:
         """Unit vector from origin to hit, shape (N, 3), float32; 0 where the sample is neither splat nor escaped."""
         state = self.checked
         used = (state.is_splat | state.is_escaped)[:, None]
         # float64, since the squares of an escaped ray's coordinates may be beyond float32
-        with np.errstate(invalid="ignore"):
-            return unit(np.where(used, self.hit.astype(np.float64) - self.origin, 0.0))
+        return unit(np.where(used, self.hit.astype(np.float64) - self.origin, 0.0))
 
     @cached_property
+    @np.errstate(invalid="ignore")
     def checked(self) -> Checked:
         """Which samples can be used for what, and how many cannot; computed once.
 
@@ -255,6 +257,7 @@ class SampleBuffer:
         return Checked(is_primary, is_splat, is_escaped, totals)
 
     @classmethod
+    @np.errstate(invalid="ignore")  # a file may hold any bits, and merely to compare a signalling NaN would warn
     def load(cls, path: PathLike) -> SampleBuffer:
         """Reads a file in the format of Lehtinen et al.'s program, version 1.2, 1.3, 2.0, 2.1 or 2.2, text or binary.
 
@@ -289,6 +292,7 @@ class SampleBuffer:
             arrays["pixel"] = pixel
         return cls(**known, pixel_to_camera=header.pixel_to_camera, **arrays)
 
+    @np.errstate(invalid="ignore")
     def save(self, path: PathLike, text: bool | None = None) -> None:
         """Writes it in version 2.2 of the format, all 39 values; where `pixel` places the samples, in version 2.1.
 
@@ -298,7 +302,7 @@ class SampleBuffer:
 
         Args:
             path: the data file; the header's name is the same with ".header" after it.
-            text: write numbers as text, about three times as large; None: if the name ends in .txt.
+            text: write numbers as text, two to three times as large; None: if the name ends in .txt.
 
         Raises:
             ValueError: there is no sample or no secondary ray, or version 2.1 cannot hold what is there.
@@ -346,16 +350,16 @@ def escaped_hit(origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
     return far.astype(np.float32)
 
 
+@np.errstate(invalid="ignore")
 def unit(vectors: np.ndarray) -> np.ndarray:
     """Vectors, shape (N, 3), made unit length in float64, as float32; 0 where the length is 0 or not finite."""
     exact = vectors.astype(np.float64, copy=False)
-    with np.errstate(invalid="ignore"):
-        length = np.sqrt(np.einsum("ij,ij->i", exact, exact))[:, None]
+    length = np.sqrt(np.einsum("ij,ij->i", exact, exact))[:, None]
     good = np.isfinite(length) & (length > 0.0)
     return np.divide(exact, length, out=np.zeros_like(exact), where=good).astype(np.float32)
 
 
-def _array(name: str, value: Any, shape: tuple[int, ...], dtype: type[np.generic], reason: str) -> np.ndarray:
+def _array(name: str, value: Any, shape: tuple[int, ...] | None, dtype: type[np.generic], reason: str) -> np.ndarray:
     try:
         array = np.asarray(value)  # no copy of numpy's arrays, nor of Warp's on the cpu
     except (TypeError, ValueError, RuntimeError) as error:
@@ -363,6 +367,7 @@ def _array(name: str, value: Any, shape: tuple[int, ...], dtype: type[np.generic
     if array.dtype != dtype:
         kind = f"an array of {array.dtype}" if isinstance(value, np.ndarray) else type(value).__name__
         raise TypeError(f"{name} is {kind}, expected an array of {np.dtype(dtype).name}")
+    shape = (array.size,) if shape is None else shape
     if array.shape != shape:
         raise ValueError(f"{name} has shape {array.shape}, expected {shape}: {reason}")
     return np.ascontiguousarray(array)

@@ -77,7 +77,8 @@ def _split_large_leaves(tree: tree_build.BinaryTree, corners: np.ndarray) -> int
     if not todo:
         return len(sizes)
     names = ("left", "right", "leaf", "lower", "upper")
-    left, right, leaf, lower, upper = columns = [list(getattr(tree, name).numpy()) for name in names]
+    columns = [list(getattr(tree, name).numpy()) for name in names]
+    left, right, leaf = columns[:3]
     order, middle = tree.order.numpy(), corners.mean(axis=1)
     while todo:
         node = todo.pop()
