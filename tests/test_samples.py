@@ -158,11 +158,11 @@ def test_long_text_is_read_block_by_block(tmp_path, monkeypatch):
     """Where the blocks of a text file are cut does not matter, nor for the line number of a fault."""
     rows = table(24)
     path = write(tmp_path / "a.txt", header(encoding="text"), as_text(rows, ",\n").encode())
-    wrong = write(tmp_path / "b.txt", header(encoding="text"), as_text(rows[:20]).encode() + b"1,2\n" + b"0," * 999)
+    wrong = write(tmp_path / "b.txt", header(encoding="text"), as_text(rows[:20]).encode() + b"\n\n1,2\n" + b"0," * 999)
     for size in (1, 7, 333, 1000, 4096):
         monkeypatch.setattr("warpgi.samples_file.BLOCK_BYTES", size)
         assert same_bits(SampleBuffer.load(path).hit_direct, rows[:, 36:39])
-        with pytest.raises(ValueError, match=r"b\.txt line 21 holds 2 numbers, expected 39"):
+        with pytest.raises(ValueError, match=r"b\.txt line 23 holds 2 numbers, expected 39"):
             SampleBuffer.load(wrong)
 
 
@@ -350,6 +350,7 @@ def test_faulty_samples_are_counted_and_left_out():
     fields["hit"][12] = 0.0, np.inf, 0.0  # escaped, but nobody knows where to
     fields["hit_normal"][13] = np.inf
     fields["hit"][14], fields["origin_normal"][14] = (1e30, 1e30, -1e30), np.nan
+    fields["throughput"][14] = np.nan
     whole = buffer(16, **fields)
     state = whole.checked
     not_primary, escaped = {6, 7, 8, 9, 10, 14}, {11, 14}

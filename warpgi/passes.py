@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 from warpgi.device import Device
 from warpgi.progress import Progress
@@ -30,6 +33,8 @@ class Passes:
     ) -> None:
         """Calls step(first, count) until `total` units are done, each call about `seconds` long.
 
+        A Ctrl-C takes effect between two steps, so that `done` and what the steps wrote agree.
+
         Args:
             step: does units `first` to `first + count - 1`.
             device: waited for after each step.
@@ -42,10 +47,27 @@ class Passes:
         while self.done < self.total:
             count = min(count, self.total - self.done)
             begin = time.perf_counter()
-            step(self.done, count)
-            device.synchronize()
-            self.done += count
+            with _interrupt_afterwards():
+                step(self.done, count)
+                device.synchronize()
+                self.done += count
             took = time.perf_counter() - begin
             if report is not None:
                 report(Progress(self.done, self.total, self.unit, time.perf_counter() - started, counts()))
             count = max(1, min(4 * count, int(count * seconds / max(took, 1e-6))))
+
+
+@contextmanager
+def _interrupt_afterwards() -> Iterator[None]:
+    """Holds a Ctrl-C back until the end; other threads than the main one never get it."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    pressed: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, frame: pressed.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if pressed:
+        signal.raise_signal(signal.SIGINT)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -216,8 +216,7 @@ class SampleBuffer:
         """Unit vector from origin to hit, shape (N, 3), float32; 0 where the sample is neither splat nor escaped."""
         state = self.checked
         used = (state.is_splat | state.is_escaped)[:, None]
-        # float64, since the squares of an escaped ray's coordinates may be beyond float32
-        return unit(np.where(used, self.hit.astype(np.float64) - self.origin, 0.0))
+        return unit(np.where(used, self.hit - self.origin, np.float32(0.0)))
 
     @cached_property
     @np.errstate(invalid="ignore")
@@ -237,7 +236,7 @@ class SampleBuffer:
         ray = _finite(self.origin, self.hit, self.radiance)
         rest = _finite(self.origin, self.bandwidth, self.hit_motion, self.time, self.throughput, self.hit_direct)
         secondary = ray & (far | rest)
-        zero_length = (self.hit == self.origin).all(axis=1)
+        zero_length = _all(self.hit == self.origin)
         origin_normal, hit_normal = _has_direction(self.origin_normal), _has_direction(self.hit_normal)
 
         is_primary = ~missed & primary & origin_normal
@@ -352,7 +351,10 @@ def escaped_hit(origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
 
 @np.errstate(invalid="ignore")
 def unit(vectors: np.ndarray) -> np.ndarray:
-    """Vectors, shape (N, 3), made unit length in float64, as float32; 0 where the length is 0 or not finite."""
+    """Vectors, shape (N, 3), made unit length as float32; 0 where they are 0 or not finite.
+
+    The squares are float64: those of a far point's coordinates or of a tiny normal's are beyond float32.
+    """
     exact = vectors.astype(np.float64, copy=False)
     length = np.sqrt(np.einsum("ij,ij->i", exact, exact))[:, None]
     good = np.isfinite(length) & (length > 0.0)
@@ -383,12 +385,17 @@ def _finite(first: np.ndarray, *others: np.ndarray | None) -> np.ndarray:
     flags = np.ones(len(first), dtype=bool)
     for array in (first, *others):
         if array is not None:
-            flags &= np.isfinite(array) if array.ndim == 1 else np.isfinite(array).all(axis=1)
+            flags &= np.isfinite(array) if array.ndim == 1 else _all(np.isfinite(array))
     return flags
 
 
 def _has_direction(vectors: np.ndarray) -> np.ndarray:
-    return _finite(vectors) & vectors.any(axis=1)
+    return _finite(vectors) & ~_all(vectors == 0.0)
+
+
+def _all(flags: np.ndarray) -> np.ndarray:
+    # of each row; numpy's reduction over a short last axis is several times slower
+    return reduce(np.logical_and, flags.T)
 
 
 def _needed(optional: dict[str, np.ndarray], coc: tuple[float, float]) -> dict[str, np.ndarray]:

@@ -101,14 +101,9 @@ def read(path: PathLike) -> tuple[Header, dict[str, np.ndarray]]:
             header, line = _read_header(name, file)
             if not header.text:
                 raise ValueError(f"{name} is binary below its own header, expected the header in {name}.header")
-        data = _read_text(name, file, header, line) if header.text else _read_binary(name, file, header)
-    channels = {}
-    start = 0
-    for channel, size in LAYOUTS[header.version]:
-        part = data[:, start] if size == 1 else data[:, start : start + size]
-        channels[channel] = np.ascontiguousarray(part)
-        start += size
-    return header, channels
+        _check_size(name, file, header)  # before anything of that size is allocated
+        blocks = _text_blocks(name, file, header, line) if header.text else _binary_blocks(name, file, header)
+        return header, _channels(header, blocks)
 
 
 def write(path: PathLike, header: Header, channels: Mapping[str, np.ndarray | None]) -> None:
@@ -119,7 +114,7 @@ def write(path: PathLike, header: Header, channels: Mapping[str, np.ndarray | No
     """
     header_name = name_of(path) + ".header"
     with atomic_write(header_name) as header_temporary:
-        header_temporary.write_text(_header_text(header), encoding="ascii")
+        header_temporary.write_text(_header_text(header), encoding="ascii", newline="\n")
         with atomic_write(path) as temporary:
             with open(temporary, "wb") as file:
                 row = ",".join(["%.9g"] * header.values) + "\n"  # 9 digits tell any two float32 apart
@@ -249,50 +244,70 @@ def _read_header(name: str, file: BinaryIO) -> tuple[Header, int]:
     return Header(**known), lines.end()
 
 
-def _read_binary(name: str, file: BinaryIO, header: Header) -> np.ndarray:
-    size = os.fstat(file.fileno()).st_size
-    want = header.count * header.values * 4  # Python's integers have no 32 bits to overflow
-    if size != want:
-        raise ValueError(f"{name} holds {size} bytes, expected {want}: {_announced(header)} of {header.values} float32")
-    data = np.fromfile(file, dtype="<f4", count=header.count * header.values)
-    if data.size != header.count * header.values:
-        raise ValueError(f"{name} became shorter while it was read")
-    return data.reshape(header.count, header.values).astype(np.float32, copy=False)
-
-
-def _read_text(name: str, file: BinaryIO, header: Header, line: int) -> np.ndarray:
+def _check_size(name: str, file: BinaryIO, header: Header) -> None:
     size = os.fstat(file.fileno()).st_size - file.tell()
-    least = header.count * header.values * 2 - 1  # a digit and a comma each
-    if size < least:
-        raise ValueError(f"{name} holds {size} bytes of text, expected {least} or more: {_announced(header)}")
-    data = np.empty((header.count, header.values), dtype=np.float32)
+    numbers = header.count * header.values  # Python's integers have no 32 bits to overflow
+    if header.text and size < 2 * numbers - 1:  # a digit and a comma each
+        raise ValueError(f"{name} holds {size} bytes of text, expected {2 * numbers - 1} or more: {_announced(header)}")
+    if not header.text and size != 4 * numbers:
+        raise ValueError(
+            f"{name} holds {size} bytes, expected {4 * numbers}: {_announced(header)} of {header.values} float32"
+        )
+
+
+def _channels(header: Header, blocks: Iterator[np.ndarray]) -> dict[str, np.ndarray]:
+    layout = LAYOUTS[header.version]
+    table = {name: np.empty((header.count, size), dtype=np.float32) for name, size in layout}
+    row = 0
+    for block in blocks:
+        start = 0
+        for name, size in layout:
+            table[name][row : row + len(block)] = block[:, start : start + size]
+            start += size
+        row += len(block)
+    return {name: table[name][:, 0] if size == 1 else table[name] for name, size in layout}
+
+
+def _binary_blocks(name: str, file: BinaryIO, header: Header) -> Iterator[np.ndarray]:
+    for first in range(0, header.count, BLOCK_SAMPLES):
+        count = min(BLOCK_SAMPLES, header.count - first)
+        block = np.fromfile(file, dtype="<f4", count=count * header.values)
+        if block.size != count * header.values:
+            raise ValueError(f"{name} became shorter while it was read")
+        yield block.reshape(count, header.values)
+
+
+def _text_blocks(name: str, file: BinaryIO, header: Header, line: int) -> Iterator[np.ndarray]:
+    """Parts of a text that starts after line `line`, which together are all the samples."""
     row = 0
     rest = b""
-    while block := file.read(BLOCK_BYTES):
-        lines, newline, rest = (rest + block).rpartition(b"\n")
-        row, line = _parse_text(name, lines + newline, header, line, data, row)
-    row, line = _parse_text(name, rest, header, line, data, row)
-    if row != header.count:
+    while row <= header.count:
+        block = file.read(BLOCK_BYTES)
+        lines, newline, rest = (rest + block).rpartition(b"\n") if block else (rest, b"", b"")
+        part = _parse_text(name, lines + newline, header, line)
+        row, line = row + len(part), line + lines.count(b"\n") + len(newline)
+        if row <= header.count:
+            yield part
+        if not block:
+            break
+    if row > header.count:
+        raise ValueError(f"{name} holds more samples than its header says: {_announced(header)}")
+    if row < header.count:
         raise ValueError(f"{name} ends after {row} samples, expected {header.count}: {_announced(header)}")
-    return data
 
 
-def _parse_text(name: str, raw: bytes, header: Header, line: int, data: np.ndarray, row: int) -> tuple[int, int]:
-    """Puts whole lines of text into `data` from `row` on; returns the next row and the number of the last line."""
-    lines = raw.count(b"\n")
+def _parse_text(name: str, raw: bytes, header: Header, line: int) -> np.ndarray:
+    """The samples in whole lines of text, of which the first comes after line `line`."""
     text = LINE_END.sub(b"", raw.replace(b"\r\n", b"\n")).decode("latin-1")
     if not text.strip():
-        return row, line + lines
+        return np.empty((0, header.values), dtype=np.float32)
     try:
         part = np.loadtxt(io.StringIO(text), dtype=np.float32, delimiter=",", comments=None, ndmin=2)
         if part.shape[1] != header.values:
             raise ValueError(f"{part.shape[1]} columns")
     except ValueError as error:
         raise ValueError(_text_fault(name, text, header, line) or f"{name} cannot be read: {error}") from error
-    if row + len(part) > header.count:
-        raise ValueError(f"{name} holds more samples than its header says: {_announced(header)}")
-    data[row : row + len(part)] = part
-    return row + len(part), line + lines
+    return part
 
 
 def _text_fault(name: str, text: str, header: Header, line: int) -> str:
