@@ -48,6 +48,7 @@ def trace_samples(
     `samples`. Surfaces that are not diffuse keep their path-traced light.
     """
     i = offset + wp.tid()
+    light_share = 1.0 / float(wp.max(light_samples, 1))
     pixel = film.first_pixel + i
     x = float(pixel % camera.width)
     y = float(pixel // camera.width)
@@ -99,10 +100,10 @@ def trace_samples(
                         wo,
                         sample_2d(light_sampler, CAMERA_PAIRS),
                         sample_2d(light_sampler, CAMERA_PAIRS + 2)[0],
-                        1.0 / float(light_samples),
+                        light_share,
                     )
                     path.shadow_rays = path.shadow_rays + light.shadow_rays
-                    path = add_light(path, depth + 1, wp.cw_mul(throughput, light.radiance) / float(light_samples))
+                    path = add_light(path, depth + 1, wp.cw_mul(throughput, light.radiance) * light_share)
 
             # the secondary ray
             b = sample(shape, s.albedo, n, wo, sample_2d(sampler, CAMERA_PAIRS + VERTEX_PAIRS * (depth - 1) + 1))
@@ -119,7 +120,6 @@ def trace_samples(
                 going = 0
                 rest = settings
                 rest.max_depth = settings.max_depth - depth
-                light_share = 1.0 / float(light_samples)
                 gathered = trace_path(
                     scene, rest, sampler, CAMERA_PAIRS + VERTEX_PAIRS * depth, o, d, b.pdf * light_share
                 )

@@ -8,9 +8,10 @@ from warpgi.device import Device
 from warpgi.lights import DistantLight, Environment, PointLight, SpotLight
 from warpgi.load import load_scene
 from warpgi.materials import Conductor, Dielectric, Diffuse, Emissive, Mirror, Texture
-from warpgi.methods import METHODS, LightField, PathTracing, Sampler
+from warpgi.methods import METHODS, AmbientOcclusion, LightField, PathTracing, Sampler
 from warpgi.metrics import compare
 from warpgi.progress import Progress
+from warpgi.reconstruct import reconstruct
 from warpgi.render import Interrupted, render, versions
 from warpgi.result import Render
 from warpgi.samples import SampleBuffer
@@ -19,6 +20,7 @@ from warpgi.scene import Scene, Shape
 
 __all__ = [
     "METHODS",
+    "AmbientOcclusion",
     "Camera",
     "Conductor",
     "Device",
@@ -42,6 +44,7 @@ __all__ = [
     "Texture",
     "compare",
     "load_scene",
+    "reconstruct",
     "render",
     "sample",
     "scenes",

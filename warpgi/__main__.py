@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import ast
+import math
 import sys
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,11 +22,27 @@ from warpgi.progress import RAY_KINDS
 MISUSE = 2  # exit status for a caller's mistake
 INTERRUPTED = 130
 
-# One subcommand a method; the table decides, so that a new method is here by being listed.
-METHOD_SETTINGS: Any = tyro.extras.subcommand_type_from_defaults(
-    {name: kind() for name, kind in gi.METHODS.items()},
-    {name: (kind.__doc__ or "").strip().splitlines()[0] for name, kind in gi.METHODS.items()},
-)
+# Counts of what a user should hear of.
+WRONG = {
+    "nonfinite": "samples were not finite and were dropped",
+    "zero_length": "samples had no length and were dropped",
+    "bad_normal": "samples had no normal and were dropped",
+    "degenerate_triangles": "triangles without area were dropped",
+    "missing_support": "reconstruction rays found no sample and were left out",
+    "cut_gathers": "reconstruction rays met more samples than were looked at",
+}
+
+
+def _subcommands(methods: Mapping[str, type]) -> Any:
+    """One subcommand a method, so that a new method is here by being listed."""
+    return tyro.extras.subcommand_type_from_defaults(
+        {name: kind() for name, kind in methods.items()},
+        {name: (kind.__doc__ or "").strip().splitlines()[0] for name, kind in methods.items()},
+    )
+
+
+METHOD_SETTINGS: Any = _subcommands(gi.METHODS)
+RECONSTRUCTIONS: Any = _subcommands({name: kind for name, kind in gi.METHODS.items() if hasattr(kind, "layers")})
 
 
 @dataclass(frozen=True)
@@ -52,40 +69,44 @@ class RenderCommand:
     """GiB that the render's arrays may take on the device."""
 
     def run(self) -> None:
-        for path in self.out:
-            check_output(path)
-        if not self.out:
-            _warn("no --out FILE.exr or --out FILE.png: the picture will not be kept")
-        if not self.memory_limit > 0.0:
-            raise ValueError(f"memory-limit is {self.memory_limit:g} GiB, expected a number above 0")
-        device = gi.Device(self.device, self.threads, int(self.memory_limit * 2**30))
+        device = _prepare(self.out, self.device, self.threads, self.memory_limit)
         scene = _open_scene(self.scene)
-        try:
-            picture = gi.render(scene, self.method, self.size, self.seed, device, progress=sys.stderr.isatty())
-        except gi.Interrupted as stop:
-            if stop.render is not None:
-                self._keep(stop.render)
-                passes = stop.passes
-                print(f"interrupted: the picture holds {passes.done} of {passes.total} {passes.unit}")
-            raise
-        self._keep(picture)
 
-    def _keep(self, picture: gi.Render) -> None:
-        for path in self.out:
-            picture.save(path, exposure=self.exposure) if path.suffix.lower() == ".png" else picture.save(path)
-        stages = ", ".join(f"{stage} {seconds:.2f} s" for stage, seconds in picture.timings.items() if seconds >= 0.005)
-        height, width = picture.image.shape[:2]
-        print(f"{picture.scene}, {picture.method}, {picture.spp} spp, {width} x {height} on {picture.device}: {stages}")
-        rays = {kind: picture.counts[kind] for kind in RAY_KINDS if kind in picture.counts}
-        seconds = picture.timings["prepare"] + picture.timings["estimate"]
-        kinds = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in rays.items())
-        print(f"{kinds}: {sum(rays.values()) / max(seconds, 1e-9) / 1e6:.2f} M rays/s")
-        if picture.counts["nonfinite"]:
-            _warn(f"{picture.counts['nonfinite']} samples were not finite and were dropped")
-        if picture.counts["degenerate_triangles"]:
-            _warn(f"{picture.counts['degenerate_triangles']} triangles without area were dropped")
-        for path in self.out:
-            print(f"wrote {path}")
+        def work() -> gi.Render:
+            return gi.render(scene, self.method, self.size, self.seed, device, progress=sys.stderr.isatty())
+
+        _make(work, self.out, self.exposure)
+
+
+@dataclass(frozen=True)
+class ReconstructCommand:
+    """Reconstruct a picture from a sample buffer; no scene is needed."""
+
+    samples: tyro.conf.Positional[Path]
+    """The sample buffer, with its .header beside it."""
+    method: RECONSTRUCTIONS = field(default_factory=gi.LightField)  # type: ignore[valid-type]
+    """What to reconstruct: indirect light by default."""
+    seed: int = 0
+    """Which random numbers."""
+    out: tyro.conf.UseAppendAction[tuple[Path, ...]] = ()
+    """Where the picture goes: .exr with all layers, .png tone-mapped; may be given more than once."""
+    exposure: float = 0.0
+    """Stops by which a .png is brightened."""
+    device: str | None = None
+    """cpu, cuda:0, ...; a GPU if there is one."""
+    threads: int | None = None
+    """CPU threads; all by default."""
+    memory_limit: float = 3.0
+    """GiB that the arrays may take on the device."""
+
+    def run(self) -> None:
+        device = _prepare(self.out, self.device, self.threads, self.memory_limit)
+        samples = gi.SampleBuffer.load(self.samples)
+
+        def work() -> gi.Render:
+            return gi.reconstruct(samples, self.method, self.seed, device, progress=sys.stderr.isatty())
+
+        _make(work, self.out, self.exposure)
 
 
 @dataclass(frozen=True)
@@ -139,6 +160,7 @@ class InfoCommand:
 
 COMMANDS = (
     Annotated[RenderCommand, tyro.conf.subcommand("render")]
+    | Annotated[ReconstructCommand, tyro.conf.subcommand("reconstruct")]
     | Annotated[CompareCommand, tyro.conf.subcommand("compare")]
     | Annotated[ScenesCommand, tyro.conf.subcommand("scenes")]
     | Annotated[MethodsCommand, tyro.conf.subcommand("methods")]
@@ -168,6 +190,47 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"warpgi: error: {error}", file=sys.stderr)
         return MISUSE
     return 0
+
+
+def _prepare(out: tuple[Path, ...], device: str | None, threads: int | None, memory_limit: float) -> gi.Device:
+    """Refuses outputs that cannot be written before any work is done, and picks the device."""
+    for path in out:
+        check_output(path)
+    if not out:
+        _warn("no --out FILE.exr or --out FILE.png: the picture will not be kept")
+    if not 0.0 < memory_limit < math.inf:
+        raise ValueError(f"memory-limit is {memory_limit:g} GiB, expected a number above 0")
+    return gi.Device(device, threads, int(memory_limit * 2**30))
+
+
+def _make(work: Callable[[], gi.Render], out: tuple[Path, ...], exposure: float) -> None:
+    """Does the work and keeps the picture, also what Ctrl-C left of it."""
+    try:
+        picture = work()
+    except gi.Interrupted as stop:
+        if stop.render is not None:
+            _keep(stop.render, out, exposure)
+            print(f"interrupted: the picture holds {stop.passes.done} of {stop.passes.total} {stop.passes.unit}")
+        raise
+    _keep(picture, out, exposure)
+
+
+def _keep(picture: gi.Render, out: tuple[Path, ...], exposure: float) -> None:
+    for path in out:
+        picture.save(path, exposure)
+    stages = ", ".join(f"{stage} {seconds:.2f} s" for stage, seconds in picture.timings.items() if seconds >= 0.005)
+    height, width = picture.image.shape[:2]
+    name = f"{picture.scene}, " if picture.scene else ""
+    print(f"{name}{picture.method}, {picture.spp} spp, {width} x {height} on {picture.device}: {stages}")
+    rays = {kind: picture.counts[kind] for kind in RAY_KINDS if kind in picture.counts}
+    seconds = picture.timings["prepare"] + picture.timings["estimate"]
+    kinds = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in rays.items())
+    print(f"{kinds}: {sum(rays.values()) / max(seconds, 1e-9) / 1e6:.2f} M rays/s")
+    for kind, meaning in WRONG.items():
+        if picture.counts.get(kind):
+            _warn(f"{picture.counts[kind]} {meaning}")
+    for path in out:
+        print(f"wrote {path}")
 
 
 def _open_scene(text: str) -> gi.Scene:

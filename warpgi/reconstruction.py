@@ -108,7 +108,8 @@ class Reconstruction:
     def near(self) -> np.ndarray:
         """Share of each sample's rays that met a surface within reach, shape (N,); 0 without a primary hit."""
         result = np.zeros(len(self.samples), np.float32)
-        result[self.primary] = self._gathered.near.numpy() / max(self.rays_done, 1)
+        known = self.rays_done - self._gathered.counts.numpy()[:, 0]
+        result[self.primary] = self._gathered.near.numpy() / np.maximum(known, 1)
         return result
 
     def all_counts(self) -> dict[str, int]:
@@ -186,7 +187,19 @@ class Reconstruction:
         self.tree.set_radiance(self._radiance)
 
 
+#: What a reconstruction launches, to be compiled first: a kernel of each module.
 KERNELS = (kernels.reconstruct, bvh.fill_blocks)
+
+
+def pixel_means(samples: SampleBuffer, values: np.ndarray) -> np.ndarray:
+    """Mean of each pixel's samples, (N, 3) -> (H, W, 3) float32; 0 where a pixel has none."""
+    shape = (samples.height, samples.width)
+    if samples.pixel is None:
+        return values.reshape(*shape, samples.spp, 3).mean(axis=2, dtype=np.float64).astype(np.float32)
+    size = shape[0] * shape[1]
+    count = np.maximum(np.bincount(samples.pixel, minlength=size), 1)
+    sums = [np.bincount(samples.pixel, values[:, channel].astype(np.float64), size) for channel in range(3)]
+    return (np.stack(sums, axis=-1) / count[:, None]).astype(np.float32).reshape(*shape, 3)
 
 
 def _octahedral(direction: np.ndarray, size: int) -> np.ndarray:

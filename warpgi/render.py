@@ -20,7 +20,7 @@ from warpgi.job import Job
 from warpgi.methods import METHODS, Method, PathTracing
 from warpgi.passes import PASS_SECONDS, Passes
 from warpgi.progress import Progress, progress_bar
-from warpgi.result import Render
+from warpgi.result import PARTS, Render
 from warpgi.scene import Scene
 from warpgi.timing import Timings
 
@@ -104,10 +104,13 @@ def render(
             raise Interrupted(None, passes) from None
         interrupted = True
     with timings.stage("image"):
-        method.finish(job, state, film)
+        special = method.finish(job, state, film)
+        layers = film.layers(on_device.centre) | special
+        if "image" in special:
+            layers = {name: layer for name, layer in layers.items() if name not in (*PARTS, "variance")}
         counts = film.counts() | method.counts(state) | {"degenerate_triangles": scene.degenerate_count}
         result = Render(
-            layers=film.layers(on_device.centre),
+            layers=layers,
             timings=dict(timings),
             counts=counts,
             spp=film.spp(),

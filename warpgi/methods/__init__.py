@@ -2,10 +2,12 @@
 
 from typing import Any, Protocol
 
+import numpy as np
 import warp as wp
 
 from warpgi.film import Film
 from warpgi.job import Job
+from warpgi.methods.ambient_occlusion import AmbientOcclusion
 from warpgi.methods.light_field import LightField
 from warpgi.methods.path import PathTracing, Sampler
 
@@ -29,14 +31,18 @@ class Method(Protocol):
     def estimate(self, job: Job, state: Any, film: Film, first: int, count: int) -> None:
         """Does units `first` to `first + count - 1` of its passes."""
 
-    def finish(self, job: Job, state: Any, film: Film) -> None:
-        """Makes the film a picture out of the units done so far."""
+    def finish(self, job: Job, state: Any, film: Film) -> dict[str, np.ndarray]:
+        """Makes the film a picture out of the units done so far; returns layers that take the place of the film's."""
 
     def counts(self, state: Any) -> dict[str, int]:
         """What it counts beside the film."""
 
 
 #: Name of a method, the stem of its files, -> its settings.
-METHODS: dict[str, type] = {"path": PathTracing, "light-field": LightField}
+METHODS: dict[str, type] = {
+    "path": PathTracing,
+    "light-field": LightField,
+    "ambient-occlusion": AmbientOcclusion,
+}
 
-__all__ = ["METHODS", "LightField", "Method", "PathTracing", "Sampler"]
+__all__ = ["METHODS", "AmbientOcclusion", "LightField", "Method", "PathTracing", "Sampler"]

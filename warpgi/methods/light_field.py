@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import warp as wp
 
 from warpgi import checks
+from warpgi.device import Device
 from warpgi.film import Film
 from warpgi.job import Job
 from warpgi.kernels.light_field import add_reflected
 from warpgi.kernels.samples import trace_samples
 from warpgi.kernels.splats import MAX_NEIGHBOURS
 from warpgi.methods.path import NEVER, Sampler
-from warpgi.reconstruction import BYTES_PER_SAMPLE, KERNELS, Preprocessing, Reconstruction
+from warpgi.reconstruction import BYTES_PER_SAMPLE, KERNELS, Preprocessing, Reconstruction, pixel_means
+from warpgi.samples import SampleBuffer
 from warpgi.sampling import SAMPLE_BYTES, trace_sample_buffer
 
 
@@ -99,24 +102,28 @@ class LightField:
             self.sampler,
             with_hit_light=self.recursive > 0,
         )
+        return self.reconstruction(samples, job.device, job.seed)
+
+    def reconstruction(self, samples: SampleBuffer, device: Device, seed: int) -> Reconstruction:
+        """Splats made of a sample buffer, ready for `gather`."""
         return Reconstruction(
-            samples,
-            job.device,
-            self.preprocessing,
-            job.seed,
-            recursions=self.recursive,
-            recursive_rays=self.recursive_rays,
+            samples, device, self.preprocessing, seed, recursions=self.recursive, recursive_rays=self.recursive_rays
         )
 
     def estimate(self, job: Job, state: Reconstruction, film: Film, first: int, count: int) -> None:
         """Sends `count` reconstruction rays from every primary hit."""
         state.gather(first, count, self.passes()[0])
 
-    def finish(self, job: Job, state: Reconstruction, film: Film) -> None:
+    def finish(self, job: Job, state: Reconstruction, film: Film) -> dict[str, np.ndarray]:
         """Adds the reconstructed light to the film's indirect layer."""
         reflected = state.reflected()
         for band in film.bands:
             job.device.launch(add_reflected, len(band), [film.load(band), reflected, self.spp])
+        return {}
+
+    def layers(self, state: Reconstruction) -> dict[str, np.ndarray]:
+        """The indirect layer of a reconstruction without a scene."""
+        return {"indirect": pixel_means(state.samples, state.reflected().numpy())}
 
     def counts(self, state: Reconstruction) -> dict[str, int]:
         """Reconstruction rays, and what was dropped, cut short or without support."""

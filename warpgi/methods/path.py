@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
+import numpy as np
 import warp as wp
 
 from warpgi import checks
@@ -84,8 +85,9 @@ class PathTracing:
             inputs = [job.scene.struct, job.camera, state, first, count]
             job.device.launch(trace_paths, len(band), inputs, [film.load(band)])
 
-    def finish(self, job: Job, state: PathSettings, film: Film) -> None:
+    def finish(self, job: Job, state: PathSettings, film: Film) -> dict[str, np.ndarray]:
         """Nothing: every pass left a finished picture in the film."""
+        return {}
 
     def counts(self, state: PathSettings) -> dict[str, int]:
         """Nothing beside the film's counts."""
