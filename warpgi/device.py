@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import os
+import sys
+import tempfile
 import threading
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -14,6 +17,8 @@ from warpgi import checks
 
 #: What a card with 4 GiB can hold beside a desktop and the CUDA context.
 DEFAULT_MEMORY_LIMIT = 3 << 30
+
+DRIVER_NOTICE = b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver."
 
 # Pieces a thread gets on average: enough to even out costly parts of a picture, few enough for launches to cost little.
 CHUNKS_PER_THREAD = 8
@@ -152,5 +157,26 @@ def _launch(kernel: wp.Kernel, count: int, place: list[int], inputs: Sequence, o
 
 
 def _cuda_count() -> int:
-    wp.init()
+    _init_warp()
     return wp.get_cuda_device_count()
+
+
+@functools.cache
+def _init_warp() -> None:
+    """Starts Warp without its notice that there is no CUDA driver: native code prints it wherever there is no GPU."""
+    try:
+        saved = os.dup(2)
+    except OSError:  # no standard error at all
+        wp.init()
+        return
+    with tempfile.TemporaryFile() as heard:
+        sys.stderr.flush()
+        os.dup2(heard.fileno(), 2)
+        try:
+            wp.init()
+        finally:
+            os.dup2(saved, 2)
+            os.close(saved)
+        heard.seek(0)
+        lines = [line for line in heard.read().splitlines(keepends=True) if not line.startswith(DRIVER_NOTICE)]
+    os.write(2, b"".join(lines))
