@@ -122,6 +122,8 @@ def reconstruct(
     seed: int,
     noise: float,
     reach: float,
+    keep_one: float,
+    keep_two: float,
     gathered: Gathered,
 ):
     """One thread owns a receiver and sends `ray_count` of its `rays_each` cosine-distributed reconstruction rays."""
@@ -144,7 +146,7 @@ def reconstruct(
         # one sequence a pixel, cut into the shares of its samples
         sampler = make_sampler(seed, pixel, place * rays_each + ray, SOBOL)
         d = to_world(frame, square_to_cosine_hemisphere(sample_2d(sampler, 0)))
-        s = first_surface(tree, o, d, noise, reach)
+        s = first_surface(tree, o, d, noise, reach, keep_one, keep_two)
         if s[3] > 0.0:
             total = total + wp.vec3(s[0], s[1], s[2]) / s[3]
             near = near + s[4] / s[3]

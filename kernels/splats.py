@@ -237,6 +237,7 @@ def shrink_crossed(
 # The first apparent surface along a ray, section 2.3.2: the gathered splats in front of the nearest conflict. A pair
 # conflicts where its event line meets the st plane in the positive, or in the negative, half-spaces of both (with the
 # authors' erratum); that is a b depth_i depth_j > 0 for a = (h_j - h_i).n_i and b = (h_j - h_i).n_j.
+# `keep_one` and `keep_two` are squared parts of their radius that splats keep which are alone, or two, in the surface.
 # Returns radiance times weight (3), weight, weight of splats nearer than `reach`, splats in the surface, and whether
 # the gather was cut short and how many undersampled surfaces were passed through.
 SURFACE = (
@@ -343,7 +344,7 @@ SURFACE = (
 """
     + WALK_TAIL
     + """
-        // one or two splats before something else are too few to trust their size (section 2.5)
+        // one or two splats before something else may be too few to trust their size (section 2.5)
         inside = 0;
         float closest = 1.0f;
         for (int j = 0; j < size; ++j) {
@@ -352,9 +353,9 @@ SURFACE = (
                 closest = wp::min(closest, e_of[j]);
             }
         }
-        if (inside == 0 || inside > 2 || limit >= 1.0e30f || passed_count + inside > 16)
+        if (keep_one >= 1.0f || inside == 0 || inside > 2 || limit >= 1.0e30f || passed_count + inside > 16)
             break;
-        if (closest <= (inside == 1 ? 0.25f : 0.4444444f))
+        if (closest <= (inside == 1 ? keep_one : keep_two))
             break;
         for (int j = 0; j < size; ++j) {
             if (t_of[j] < limit)
@@ -388,4 +389,6 @@ SURFACE = (
 
 
 @wp.func_native(SURFACE)
-def first_surface(tree: SplatTree, o: wp.vec3, d: wp.vec3, noise: float, reach: float) -> vec8: ...
+def first_surface(
+    tree: SplatTree, o: wp.vec3, d: wp.vec3, noise: float, reach: float, keep_one: float, keep_two: float
+) -> vec8: ...

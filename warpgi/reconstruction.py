@@ -30,7 +30,7 @@ BYTES_PER_SAMPLE = 5 * 12 + 48 + 36 + 40
 
 @dataclass(frozen=True)
 class Preprocessing:
-    """How splats are sized; the sections are of Lehtinen et al. 2012."""
+    """How splats are sized and read; the sections are of Lehtinen et al. 2012."""
 
     neighbours: int
     """k of the k-NN search, the sample counted (2.2)."""
@@ -38,6 +38,8 @@ class Preprocessing:
     """Stretch of distances along the normal (2.2)."""
     margin: float
     """Part of an input ray's length, at either end, in which a crossed splat is not shrunk (2.3.1)."""
+    lone_radius: float
+    """Part of its radius that a splat keeps where it is alone in the first surface (2.5)."""
 
 
 class Reconstruction:
@@ -173,6 +175,9 @@ class Reconstruction:
         self, receivers: kernels.Receivers, gathered: kernels.Gathered, size: int, first: int, count: int, each: int
     ) -> None:
         inputs = [self.tree.struct, self.sky, receivers, each, first, count, self.seed, self.noise, self.reach]
+        lone = self.preprocessing.lone_radius
+        # half the radius for one means two thirds for two
+        inputs += [lone**2, (1.0 - (1.0 - lone) * 2.0 / 3.0) ** 2]
         self.device.launch(kernels.reconstruct, size, inputs, [gathered])
         self.counts["reconstruction_rays"] += size * count
 

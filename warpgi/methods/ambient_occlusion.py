@@ -45,6 +45,9 @@ class AmbientOcclusion:
     margin: float = 1e-3
     """Part of an input ray at either end in which the splats that it crosses do not shrink, in [0, 0.5)."""
 
+    lone_radius: float = 1.0
+    """Part of its radius that a splat keeps where it alone is the first surface on a ray, in (0, 1]."""
+
     def __post_init__(self) -> None:
         checks.count("spp", self.spp)
         checks.count("rays", self.rays)
@@ -53,6 +56,7 @@ class AmbientOcclusion:
         checks.count("neighbours", self.neighbours, 2, MAX_NEIGHBOURS)
         checks.number("alpha", self.alpha, 1.0)
         checks.number("margin", self.margin, 0.0, 0.499)
+        checks.number("lone_radius", self.lone_radius, 0.0, 1.0, open_lower=True)
 
     @property
     def kernels(self) -> tuple[wp.Kernel, ...]:
@@ -74,7 +78,7 @@ class AmbientOcclusion:
 
     def reconstruction(self, samples: SampleBuffer, device: Device, seed: int) -> Reconstruction:
         """Splats made of a sample buffer, ready for `gather`."""
-        preprocessing = Preprocessing(self.neighbours, self.alpha, self.margin)
+        preprocessing = Preprocessing(self.neighbours, self.alpha, self.margin, self.lone_radius)
         return Reconstruction(samples, device, preprocessing, seed, reach=self.radius)
 
     def estimate(self, job: Job, state: Reconstruction, film: Film, first: int, count: int) -> None:
