@@ -7,7 +7,7 @@ from pathlib import Path
 
 import tyro
 
-from bench import rays
+from bench import figures, rays, reconstruction
 
 MISUSE = 2  # exit status for a caller's mistake
 INTERRUPTED = 130
@@ -21,9 +21,10 @@ def rays_command(
     repeats: int = 7,
     threads: int | None = None,
     peers: bool = False,
+    samples: Path | None = None,
     json: Path | None = None,
 ) -> None:
-    """Measure rays and paths per second, compile time, upload time and memory.
+    """Measure rays, paths and reconstruction rays per second, compile time, upload time and memory.
 
     Args:
         device: cpu, cuda, cuda:0, ...; a GPU if there is one.
@@ -33,15 +34,68 @@ def rays_command(
         repeats: Times that everything is measured, in turn; the table shows medians.
         threads: CPU threads; all by default.
         peers: Measure Mitsuba 3 too, on the same pictures, and compare these.
+        samples: Sample buffer from which reconstruction is measured too.
         json: File for the measurements and what they were made with.
     """
-    rays.run(rays.Settings(device, scenes, size, spp, repeats, threads, peers), json)
+    rays.run(rays.Settings(device, scenes, size, spp, repeats, threads, peers, samples), json)
+
+
+def scaling_command(
+    device: str | None = None,
+    scenes: tuple[str, ...] = ("cornell-box", "courtyard"),
+    size: tuple[int, int] = (96, 96),
+    rays: tuple[int, ...] = (64, 128, 256),
+    spp: tuple[int, ...] = (1, 2, 4, 8),
+    repeats: int = 3,
+    threads: int | None = None,
+    json: Path | None = None,
+) -> None:
+    """Measure how the time of light-field reconstruction grows, and the memory of a sample.
+
+    Args:
+        device: cpu, cuda, cuda:0, ...; a GPU if there is one.
+        scenes: Built-in scenes; others are compared with the first.
+        size: Width and height in pixels.
+        rays: Reconstruction rays per pixel; the last goes with each of `spp` and of `scenes`.
+        spp: Input samples per pixel; the last goes with each of `rays` and of `scenes`.
+        repeats: Times that everything is measured, in turn; the table shows medians.
+        threads: CPU threads; all by default.
+        json: File for the measurements and what they were made with.
+    """
+    reconstruction.run_scaling(reconstruction.ScalingSettings(device, scenes, size, rays, spp, repeats, threads), json)
+
+
+def figures_command(
+    out: Path,
+    scene: str = "cornell-box",
+    size: tuple[int, int] = (256, 256),
+    spp: int = 8,
+    rays: int = 256,
+    reference_spp: int = 1024,
+    exposure: float = 0.0,
+    device: str | None = None,
+) -> None:
+    """Picture of the indirect light of a scene: input, reconstruction and reference side by side.
+
+    Args:
+        out: PNG to write.
+        scene: Built-in scene.
+        size: Width and height of each panel in pixels.
+        spp: Input samples per pixel.
+        rays: Reconstruction rays per pixel.
+        reference_spp: Paths per pixel of the reference.
+        exposure: Stops by which the picture is brightened.
+        device: cpu, cuda, cuda:0, ...; a GPU if there is one.
+    """
+    figures.light_field(out, scene, size, spp, rays, reference_spp, exposure, device)
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs one command and returns its exit status: 0, or 2 for a caller's mistake, or 130 after Ctrl-C."""
     app = tyro.extras.SubcommandApp()
     app.command(rays_command, name="rays")
+    app.command(figures_command, name="figures")
+    app.command(scaling_command, name="scaling")
     try:
         app.cli(prog="python -m bench", args=arguments, config=(tyro.conf.FlagCreatePairsOff,))
     except KeyboardInterrupt:

@@ -1,4 +1,6 @@
-"""Rays and paths per second, beside `wp.mesh_query_ray` on the same rays and Mitsuba on the same pictures."""
+"""Rays, paths and reconstruction rays per second: beside `wp.mesh_query_ray` on the same rays, Mitsuba on the same
+pictures, and a yardstick of the machine.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,9 @@ import warp as wp
 import warpgi as gi
 from bench.compiling import compile_rows
 from bench.mitsuba_peer import MitsubaPeer, NoCounterpart
+from bench.reconstruction import AUTHORS, AUTHORS_YARDSTICK, SPP, stage_rows, yardstick
 from bench.report import Row, circumstances, paired_ratio, print_table, row, write_json
+from bench.turns import take_turns
 from warpgi import checks
 from warpgi.device_scene import DeviceScene
 from warpgi.film import BYTES_PER_PIXEL, Film
@@ -53,6 +57,7 @@ class Settings:
     repeats: int
     threads: int | None
     peers: bool
+    samples: Path | None = None
 
     def __post_init__(self) -> None:
         for name in ("spp", "repeats"):
@@ -163,6 +168,7 @@ def run(settings: Settings, json: Path | None) -> None:
         OSError: the file cannot be written.
     """
     device = gi.Device(settings.device, settings.threads)
+    buffer = None if settings.samples is None else gi.SampleBuffer.load(settings.samples)
     scenes = [build(name) for name in settings.scenes]
     seen = versions()
     peers: dict[str, MitsubaPeer] = {}
@@ -176,10 +182,17 @@ def run(settings: Settings, json: Path | None) -> None:
     about = circumstances(device, seen)
     with atomic_write(json) if json else nullcontext() as file:
         rows = compile_rows(device.name)
-        device.load([*KERNELS, *_path_tracing(settings).kernels])
+        device.load([*KERNELS, *_path_tracing(settings).kernels, *gi.LightField().kernels])
         gi.Device("cpu").load([tree_build.read_tree])
+        yard = yardstick(device)
         for scene in scenes:
             rows += scene_rows(scene, settings, device, peers.get(scene.name), notes.get(scene.name, ""))
+            samples = gi.sample(scene, SPP, settings.size, SEED, device)
+            rows += stage_rows(scene.name, samples, device, settings.repeats, yard)
+        if buffer is not None:
+            rows += stage_rows(settings.samples.name, buffer, device, settings.repeats, yard)
+        if yard is not None and yard.rates:
+            rows.append(yard.row())
         print_table(rows)
         if file is not None:
             write_json(file, about, _settings_of_record(settings, device, peers), rows)
@@ -299,21 +312,6 @@ def agreement_rows(scene: str, pictures: Sequence[np.ndarray], others: Sequence[
     ]
 
 
-def take_turns(jobs: dict[str, Callable[[], None]], repeats: int, device: gi.Device) -> dict[str, list[float]]:
-    """Seconds of each job in each repeat, after one run to warm up; every second repeat goes the other way round."""
-    seconds: dict[str, list[float]] = {name: [] for name in jobs}
-    for job in jobs.values():
-        job()
-    device.synchronize()
-    for repeat in range(repeats):
-        for name in list(jobs)[:: 1 if repeat % 2 == 0 else -1]:
-            start = time.perf_counter()
-            jobs[name]()
-            device.synchronize()
-            seconds[name].append(time.perf_counter() - start)
-    return seconds
-
-
 def _differ(hits: kernels.Hits, others: kernels.Hits) -> np.ndarray:
     """Which rays met surfaces at another distance, beyond what rounding explains; at edges the face may differ."""
     t, s = hits.t.numpy(), others.t.numpy()
@@ -327,6 +325,10 @@ def _path_tracing(settings: Settings) -> gi.PathTracing:
 
 def _settings_of_record(settings: Settings, device: gi.Device, peers: dict[str, MitsubaPeer]) -> dict[str, Any]:
     record = asdict(settings) | {"max_depth": MAX_DEPTH, "threads": device.threads, "device": device.name}
+    record["samples"] = None if settings.samples is None else str(settings.samples)
+    record["authors"] = {
+        name: {"rate": rate, "of_yardstick": rate / AUTHORS_YARDSTICK} for name, rate in AUTHORS.items()
+    }
     for peer in peers.values():
         threads = {"threads": peer.drjit.thread_count(), "threads_set_by": "drjit.set_thread_count"}
         record["mitsuba"] = {"variant": peer.mitsuba.variant(), "integrator": "path", **threads}

@@ -4,7 +4,8 @@ Tests run in plain loops over eight lanes, which a CPU's compiler turns into vec
 are; only the step from a vector of answers to bits needs saying twice.
 """
 
-#: Opens native code: `lane_mask` packs eight answers, 0 or 1, into bits; `next_lane` takes the lowest bit out.
+#: Opens native code: `lane_mask` packs eight answers, 0 or 1, into bits; `next_lane` takes the lowest bit out;
+#: `prefetch` asks for 64 numbers ahead of their use; `larger` and `smaller` are for numbers alone.
 LANES_HEAD = """
 #if defined(__CUDA_ARCH__)
     auto lane_mask = [](const int* met) {
@@ -18,7 +19,12 @@ LANES_HEAD = """
         mask &= mask - 1u;
         return k;
     };
+    auto prefetch = [](const float*) {};
 #else
+    auto prefetch = [](const float* p) {
+        for (int k = 0; k < 64; k += 16)
+            __builtin_prefetch(p + k);
+    };
     typedef int lanes_of_int __attribute__((vector_size(32), aligned(4)));
     typedef bool lanes_of_bool __attribute__((ext_vector_type(8)));
     auto lane_mask = [](const int* met) {
@@ -31,4 +37,7 @@ LANES_HEAD = """
         return k;
     };
 #endif
+    // one instruction each; Warp's heed NaN and take three
+    auto larger = [](float a, float b) { return a > b ? a : b; };
+    auto smaller = [](float a, float b) { return a < b ? a : b; };
 """

@@ -99,9 +99,9 @@ NEAREST = (
             float d2[8];
             int met[8];
             for (int j = 0; j < 8; ++j) {
-                const float dx = wp::max(wp::max(p[j] - cx, cx - p[24 + j]), 0.0f);
-                const float dy = wp::max(wp::max(p[8 + j] - cy, cy - p[32 + j]), 0.0f);
-                const float dz = wp::max(wp::max(p[16 + j] - cz, cz - p[40 + j]), 0.0f);
+                const float dx = larger(larger(p[j] - cx, cx - p[24 + j]), 0.0f);
+                const float dy = larger(larger(p[8 + j] - cy, cy - p[32 + j]), 0.0f);
+                const float dz = larger(larger(p[16 + j] - cz, cz - p[40 + j]), 0.0f);
                 d2[j] = dx * dx + dy * dy + dz * dz;
                 met[j] = (int)(d2[j] < worst);
             }
@@ -130,7 +130,7 @@ NEAREST = (
 def nearest_distance2(tree: SplatTree, i: int, k: int, stretch: float) -> float: ...
 
 
-# Walks the boxes along a ray and hands each block it meets to CODE, nearest first, as long as `limit` is not passed.
+# Walks the boxes along a ray and hands each block that it meets beyond `start` and before `limit` on, nearest first.
 WALK_HEAD = (
     LANES_HEAD
     + """
@@ -158,10 +158,10 @@ WALK_LOOP = """
             float near[8];
             int met[8];
             for (int k = 0; k < 8; ++k) {
-                const float enter = wp::max(
-                    wp::max(p[ax + k] * rx - ox, p[ay + k] * ry - oy), wp::max(p[az + k] * rz - oz, 0.0f));
-                const float leave = wp::min(
-                    wp::min(p[bx + k] * rx - ox, p[by + k] * ry - oy), wp::min(p[bz + k] * rz - oz, limit));
+                const float enter = larger(
+                    larger(p[ax + k] * rx - ox, p[ay + k] * ry - oy), larger(p[az + k] * rz - oz, start));
+                const float leave = smaller(
+                    smaller(p[bx + k] * rx - ox, p[by + k] * ry - oy), smaller(p[bz + k] * rz - oz, limit));
                 near[k] = enter;
                 met[k] = enter <= leave * 1.0000004f ? 1 : 0;
             }
@@ -178,6 +178,11 @@ WALK_LOOP = """
                 }
                 entry[slot] = near[k];
                 stack[slot] = first >= 0 ? first + k : first - k;
+                // it waits for its turn on the stack, which hides some of the latency of memory
+                if (first < 0)
+                    prefetch(tree.blocks.data + (size_t)(k - 1 - first) * 80);
+                else
+                    prefetch(tree.nodes.data + (size_t)(first + k) * 48);
             }
         } else {
             const int block = -1 - current;
@@ -193,7 +198,7 @@ WALK_TAIL = """
 # that neither the order of rays nor the number of threads matters.
 SHRINK = (
     WALK_HEAD
-    + "    const float limit = length - margin;\n    int crossed = 0;\n"
+    + "    const float start = margin, limit = length - margin;\n    int crossed = 0;\n"
     + WALK_LOOP
     + """
             float e2[8];
@@ -246,7 +251,7 @@ SURFACE = (
     float hx[72], hy[72], hz[72], gx[72], gy[72], gz[72], depth[72], t_of[72], e_of[72];
     for (int j = 0; j < 72; ++j)
         hx[j] = hy[j] = hz[j] = gx[j] = gy[j] = gz[j] = depth[j] = 0.0f;
-    const float slack_noise2 = 16.0f * noise * noise;
+    const float start = 0.0f, slack_noise2 = 16.0f * noise * noise;
     int place[64];
     int passed[16];
     int passed_count = 0, surfaces_passed = 0, cut = 0;
@@ -328,12 +333,12 @@ SURFACE = (
                         const float slack2 = 1.0e-4f * (dx * dx + dy * dy + dz * dz) + slack_noise2;
                         const bool conflict =
                             (a * b * (depth[j + c] * far) > 0.0f) & (a * a > slack2) & (b * b > slack2);
-                        const float both = wp::max(t_of[j + c], t[k]);
-                        first_conflict[c] = wp::min(first_conflict[c], conflict ? both : 1.0e30f);
+                        const float both = larger(t_of[j + c], t[k]);
+                        first_conflict[c] = smaller(first_conflict[c], conflict ? both : 1.0e30f);
                     }
                 }
                 for (int c = 0; c < 8; ++c)
-                    limit = wp::min(limit, first_conflict[c]);
+                    limit = smaller(limit, first_conflict[c]);
                 hx[size] = px; hy[size] = py; hz[size] = pz;
                 gx[size] = nx; gy[size] = ny; gz[size] = nz;
                 depth[size] = far; t_of[size] = t[k];
@@ -350,7 +355,7 @@ SURFACE = (
         for (int j = 0; j < size; ++j) {
             if (t_of[j] < limit) {
                 ++inside;
-                closest = wp::min(closest, e_of[j]);
+                closest = smaller(closest, e_of[j]);
             }
         }
         if (keep_one >= 1.0f || inside == 0 || inside > 2 || limit >= 1.0e30f || passed_count + inside > 16)

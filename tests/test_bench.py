@@ -25,6 +25,7 @@ def bench(monkeypatch):
     import bench.__main__
     import bench.mitsuba_peer
     import bench.rays
+    import bench.reconstruction
 
     return bench
 
@@ -41,18 +42,63 @@ def test_rays_prints_a_table_and_writes_json(tmp_path):
     for name in rows:
         assert name in done.stdout
     kinds = ("closest hit, camera rays", "closest hit, secondary rays", "shadow rays", "path tracing, depth 6")
-    assert set(kinds) <= set(rows)
+    stages = ("reconstruction", "build", "knn", "shrink", "preprocessing", "sample, host", "sample, device")
+    assert set(kinds) | set(stages) <= set(rows)
     for row in content["rows"]:
         assert row["low"] <= row["value"] <= row["high"]
         assert row["value"] > 0.0
     for name in kinds[:2]:
         assert rows[name]["versus"] == "wp.mesh_query_ray"
         assert rows[name]["ratio"] > 0.0
+    assert rows["sample, host"]["value"] == 72
+    for name, authors in content["settings"]["authors"].items():
+        per_yardstick = rows[name]["value"] / rows["scipy cKDTree"]["value"]
+        assert rows[name]["ratio"] == pytest.approx(per_yardstick)
+        assert rows[f"{name}, times the authors'"]["value"] == pytest.approx(per_yardstick / authors["of_yardstick"])
     assert content["device"] == "cpu"
     assert content["settings"]["size"] == [32, 32]
     assert {"warpgi", "warp", "numpy"} <= set(content["versions"])
     assert {"commit", "dirty", "date", "cpu", "threads"} <= set(content)
     assert list(tmp_path.iterdir()) == [out]
+
+
+def test_rays_takes_a_sample_buffer(bench, capsys, monkeypatch, tmp_path):
+    """`--samples` measures reconstruction on a buffer of whatever origin; its rows bear the file's name."""
+    monkeypatch.setattr(bench.rays, "compile_rows", lambda device: [])
+    gi.sample(build("cornell-box"), 2, (8, 8), device="cpu").save(tmp_path / "box.bin")
+    arguments = ["--device", "cpu", "--repeats", "1", "--samples", str(tmp_path / "box.bin"), "--scenes"]
+    assert bench.__main__.main(["rays", *arguments]) == 0
+    out = capsys.readouterr().out
+    assert "box.bin" in out
+    assert "of 128 samples" in out
+
+
+def test_without_scipy_there_is_no_yardstick(bench, monkeypatch):
+    """Rates are measured all the same, and a note says what is missing."""
+    monkeypatch.setitem(sys.modules, "scipy.spatial", None)
+    device = gi.Device("cpu")
+    assert bench.reconstruction.yardstick(device) is None
+    samples = gi.sample(build("cornell-box"), 1, (8, 8), device=device)
+    rows = {row.what: row for row in bench.reconstruction.stage_rows("box", samples, device, 1, None)}
+    assert "scipy is not installed" in rows["reconstruction"].note
+    assert rows["reconstruction"].ratio is None
+
+
+def test_scaling_compares_rays_samples_and_scenes(bench, tmp_path, capsys):
+    """Every case but the first of its kind has a ratio to that one."""
+    out = tmp_path / "out.json"
+    arguments = ["--device", "cpu", "--size", "16", "16", "--rays", "8", "16", "--spp", "1", "2", "--repeats", "1"]
+    assert bench.__main__.main(["scaling", *arguments, "--json", str(out)]) == 0
+    capsys.readouterr()
+    content = json.loads(out.read_text())
+    versus = {(row["scene"], row["what"]): row["versus"] for row in content["rows"]}
+    assert versus["cornell-box", "16 rays, 2 spp"] == "8 rays"
+    assert versus["cornell-box", "2 spp, 16 rays"] == "1 spp"
+    assert versus["courtyard", "16 rays, 2 spp"] == "cornell-box"
+    assert versus["cornell-box", "8 rays, 2 spp"] is None
+    for row in content["rows"]:
+        assert row["value"] > 0.0
+        assert (row["ratio"] is None) == (row["versus"] is None)
 
 
 @pytest.mark.parametrize(
@@ -62,6 +108,7 @@ def test_rays_prints_a_table_and_writes_json(tmp_path):
         ("--scenes cornell-bax", "did you mean 'cornell-box'"),
         ("--size 0 32", "width is 0"),
         ("--threads 0", "threads is 0"),
+        ("--samples nowhere.bin", "nowhere.bin"),
         ("--json nowhere/out.json", "nowhere"),
     ],
 )
