@@ -8,7 +8,17 @@ from warpgi.kernels.direct import add_features, direct_light, emitted, facing_no
 from warpgi.kernels.film import Film, PathSample, add_sample
 from warpgi.kernels.path import CAMERA_PAIRS, VERTEX_PAIRS, PathSettings, add_light, trace_path
 from warpgi.kernels.rng import make_sampler, sample_2d
-from warpgi.kernels.scene import DIELECTRIC, DIFFUSE, MIRROR, Scene, closest_hit, offset_origin, surface_at
+from warpgi.kernels.scene import (
+    DIELECTRIC,
+    DIFFUSE,
+    FAR,
+    MIRROR,
+    Scene,
+    closest_hit,
+    occluded,
+    offset_origin,
+    surface_at,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -20,7 +30,9 @@ MAX_CHAIN = wp.constant(16)
 
 @wp.struct
 class SampleArrays:
-    first_sample: int  # of the band's first pixel
+    first_pixel: int  # of the band
+    hits: int  # primary hits of a pixel
+    spp: int  # how many of them send a secondary ray, the first ones
     origin: wp.array[wp.vec3]  # primary hit, or NO_HIT
     origin_normal: wp.array[wp.vec3]
     albedo: wp.array[wp.vec3]  # of the primary hit, times what mirrors before it left
@@ -37,25 +49,26 @@ def trace_samples(
     scene: Scene,
     camera: Camera,
     settings: PathSettings,
-    spp: int,
-    first_index: int,
-    index_count: int,
     light_samples: int,
     film: Film,
     samples: SampleArrays,
 ):
     """One thread owns one pixel: traces its paths, puts what reconstruction leaves alone into `film`, the rest into
     `samples`. Surfaces that are not diffuse keep their path-traced light.
+
+    `light_samples` shadow rays go out from each primary hit, for the noise of direct light stays in the picture.
     """
     i = offset + wp.tid()
     light_share = 1.0 / float(wp.max(light_samples, 1))
     pixel = film.first_pixel + i
     x = float(pixel % camera.width)
     y = float(pixel // camera.width)
-    for index in range(first_index, first_index + index_count):
-        k = samples.first_sample + i * spp + index
-        samples.origin[k] = wp.vec3(NO_HIT)
-        samples.hit[k] = wp.vec3(NO_HIT)
+    for index in range(samples.hits):
+        place = (samples.first_pixel + i) * samples.hits + index
+        k = (samples.first_pixel + i) * samples.spp + index
+        samples.origin[place] = wp.vec3(NO_HIT)
+        if index < samples.spp:
+            samples.hit[k] = wp.vec3(NO_HIT)
         sampler = make_sampler(settings.seed, pixel, index, settings.sampler)
         u = sample_2d(sampler, 0)
         lens = wp.vec2(0.0)
@@ -88,7 +101,9 @@ def trace_samples(
                 n = facing_normal(s, wo)
             delta = shape.kind == DIELECTRIC or shape.kind == MIRROR
 
-            # light sampling, several for the one path: its noise would be left in the picture
+            # light sampling; alone in charge of lamps where no secondary ray looks for them
+            has_ray = index < samples.spp or shape.kind != DIFFUSE
+            share = wp.where(has_ray, light_share, 0.0)
             if scene.light_count > 0 and not delta:
                 for j in range(light_samples):
                     light_sampler = make_sampler(settings.seed, pixel, index * light_samples + j, settings.sampler)
@@ -100,7 +115,7 @@ def trace_samples(
                         wo,
                         sample_2d(light_sampler, CAMERA_PAIRS),
                         sample_2d(light_sampler, CAMERA_PAIRS + 2)[0],
-                        light_share,
+                        share,
                     )
                     path.shadow_rays = path.shadow_rays + light.shadow_rays
                     path = add_light(path, depth + 1, wp.cw_mul(throughput, light.radiance) * light_share)
@@ -116,6 +131,15 @@ def trace_samples(
             if delta:
                 throughput = wp.cw_mul(throughput, b.weight)
                 depth = depth + 1
+            elif not has_ray:
+                going = 0
+                samples.origin[place] = s.p
+                samples.origin_normal[place] = n
+                samples.albedo[place] = wp.cw_mul(throughput, b.weight)
+                if wp.max(scene.environment) > 0.0:
+                    path.shadow_rays = path.shadow_rays + 1
+                    if not occluded(scene, o, d, FAR):
+                        path = add_light(path, depth + 1, wp.cw_mul(samples.albedo[place], scene.environment))
             else:
                 going = 0
                 rest = settings
@@ -129,9 +153,9 @@ def trace_samples(
                 path = add_light(path, depth + 1, wp.cw_mul(weight, gathered.emission))
                 incident = gathered.direct + gathered.indirect
                 if shape.kind == DIFFUSE:
-                    samples.origin[k] = s.p
-                    samples.origin_normal[k] = n
-                    samples.albedo[k] = weight
+                    samples.origin[place] = s.p
+                    samples.origin_normal[place] = n
+                    samples.albedo[place] = weight
                     samples.radiance[k] = incident
                     if gathered.depth >= 0.0:
                         samples.hit[k] = gathered.position

@@ -14,7 +14,7 @@ import warp as wp
 from warpgi.device import Device
 from warpgi.kernels import bvh
 from warpgi.kernels import light_field as kernels
-from warpgi.samples import SampleBuffer
+from warpgi.samples import NO_HIT, SampleBuffer
 from warpgi.splat_tree import SplatTree
 
 # Position rounding in units of float32's spacing at the largest coordinate: positions come from a few operations.
@@ -26,6 +26,8 @@ SKY_MAX_SIZE = 64
 
 # Device bytes a sample: five vectors, the splat in its block with nodes, order and sort keys, sums and counts.
 BYTES_PER_SAMPLE = 5 * 12 + 48 + 36 + 40
+# And a primary hit of its own: three vectors, its number, its sums and counts.
+BYTES_PER_HIT = 3 * 12 + 4 + 32
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,20 @@ class Preprocessing:
     """Part of its radius that a splat keeps where it is alone in the first surface (2.5)."""
 
 
+@dataclass(frozen=True)
+class PrimaryHits:
+    """Where light is gathered, in pixel order; rows without a primary hit have coordinates of 1e10 and more."""
+
+    origin: np.ndarray
+    """Positions, shape (M, 3), float32."""
+    normal: np.ndarray
+    """Unit normals, shape (M, 3), float32."""
+    albedo: np.ndarray
+    """What they reflect, shape (M, 3), float32."""
+    per_pixel: int
+    """Rows of a pixel."""
+
+
 class Reconstruction:
     """Splats made from samples, and sums of what reconstruction rays found for each receiver.
 
@@ -50,6 +66,7 @@ class Reconstruction:
         device: where it computes.
         preprocessing: how splats are sized.
         seed: which reconstruction rays.
+        hits: where light is gathered; None: at the samples' own primary hits.
         reach: distance within which a surface counts as near, for ambient occlusion.
 
     Raises:
@@ -62,6 +79,7 @@ class Reconstruction:
         device: Device,
         preprocessing: Preprocessing,
         seed: int,
+        hits: PrimaryHits | None = None,
         reach: float = np.inf,
         recursions: int = 0,
         recursive_rays: int = 16,
@@ -77,8 +95,9 @@ class Reconstruction:
         self.reach = min(float(reach), 1e30)
         state = samples.checked
         splats = np.flatnonzero(state.is_splat).astype(np.int32)
-        self.primary = np.flatnonzero(state.is_primary).astype(np.int32)
-        self._upload(splats)
+        self._upload(splats, hits)
+        is_primary = state.is_primary if hits is None else np.abs(hits.origin).max(axis=1) < NO_HIT
+        self.primary = np.flatnonzero(is_primary).astype(np.int32)
         self.tree = SplatTree(device, self._hits, self._hit_normals, self._radiance, splats, self.noise)
         rays = kernels.Rays()
         rays.origins, rays.hits, rays.order = self._origins, self._hits, self.tree.order
@@ -90,7 +109,8 @@ class Reconstruction:
         self.counts |= {"splats": len(splats), "reconstruction_rays": 0}
         for _ in range(recursions):
             self._relight(splats, recursive_rays)
-        self._receivers = self._make_receivers(self.primary, self._origins, self._origin_normals)
+        per_pixel = samples.spp if hits is None else hits.per_pixel
+        self._receivers = self._make_receivers(self.primary, self._receiver_origins, self._receiver_normals, per_pixel)
         self._gathered = self._make_gathered(len(self.primary))
         self.rays_done = 0
 
@@ -100,10 +120,9 @@ class Reconstruction:
         self.rays_done += count
 
     def reflected(self) -> wp.array:
-        """Indirect light that each sample's primary hit reflects, vec3 on the device, one for each sample."""
-        albedo = self.device.array(self.samples.albedo, wp.vec3)
-        result = self.device.zeros(len(self.samples), wp.vec3)
-        inputs = [self._receivers, self._gathered, self.rays_done, albedo]
+        """Indirect light that each primary hit reflects, vec3 on the device; 0 for rows without one."""
+        result = self.device.zeros(self._receiver_albedo.size, wp.vec3)
+        inputs = [self._receivers, self._gathered, self.rays_done, self._receiver_albedo]
         self.device.launch(kernels.reflect, len(self.primary), inputs, [result])
         return result
 
@@ -120,7 +139,7 @@ class Reconstruction:
         names = ("missing_support", "sky_rays", "cut_gathers", "undersampled_surfaces")
         return self.counts | dict(zip(names, found.tolist(), strict=True))
 
-    def _upload(self, splats: np.ndarray) -> None:
+    def _upload(self, splats: np.ndarray, receivers: PrimaryHits | None) -> None:
         """Positions relative to the splats' centre, so that float32 serves samples far away."""
         samples, device = self.samples, self.device
         used = samples.hit[splats] if len(splats) else np.zeros((1, 3), np.float32)
@@ -130,9 +149,15 @@ class Reconstruction:
         with np.errstate(invalid="ignore", over="ignore"):
             self._origins = device.array(samples.origin - centre, wp.vec3)
             self._hits = device.array(samples.hit - centre, wp.vec3)
-        self._origin_normals = device.array(samples.unit_origin_normal, wp.vec3)
         self._hit_normals = device.array(samples.unit_hit_normal, wp.vec3)
         self._radiance = device.array(samples.radiance, wp.vec3)
+        if receivers is None:
+            receivers = PrimaryHits(samples.origin, samples.unit_origin_normal, samples.albedo, samples.spp)
+            self._receiver_origins = self._origins
+        else:
+            self._receiver_origins = device.array(receivers.origin - centre, wp.vec3)
+        self._receiver_normals = device.array(receivers.normal, wp.vec3)
+        self._receiver_albedo = device.array(receivers.albedo, wp.vec3)
 
     def _sky(self, escaped: np.ndarray) -> kernels.Sky:
         """Mean radiance of escaped rays by direction; texels that no ray met take the mean of all."""
@@ -152,10 +177,12 @@ class Reconstruction:
         sky.size, sky.radiance = size, self.device.array(texels, wp.vec3)
         return sky
 
-    def _make_receivers(self, sample: np.ndarray, origins: wp.array, normals: wp.array) -> kernels.Receivers:
+    def _make_receivers(
+        self, sample: np.ndarray, origins: wp.array, normals: wp.array, per_pixel: int
+    ) -> kernels.Receivers:
         receivers = kernels.Receivers()
         receivers.sample = self.device.array(sample, int)
-        receivers.origins, receivers.normals, receivers.spp = origins, normals, self.samples.spp
+        receivers.origins, receivers.normals, receivers.spp = origins, normals, per_pixel
         pixels = places = np.zeros(0, np.int32)
         if self.samples.pixel is not None:
             pixels = self.samples.pixel
@@ -184,7 +211,7 @@ class Reconstruction:
     def _relight(self, splats: np.ndarray, rays: int) -> None:
         """Recursive filtering (section 4): the splats' own light, reconstructed, replaces what one path brought."""
         device, samples = self.device, self.samples
-        receivers = self._make_receivers(splats, self._hits, self._hit_normals)
+        receivers = self._make_receivers(splats, self._hits, self._hit_normals, samples.spp)
         gathered = self._make_gathered(len(splats))
         self._trace(receivers, gathered, len(splats), 0, rays, rays)
         parts = [device.array(part, wp.vec3) for part in (samples.hit_direct, samples.throughput)]

@@ -113,7 +113,7 @@ def render(
             layers=layers,
             timings=dict(timings),
             counts=counts,
-            spp=film.spp(),
+            spp=min(film.spp(), method.spp),
             scene=scene.name,
             **provenance(method, seed, where),
         )

@@ -14,41 +14,54 @@ from warpgi.kernels import rng
 from warpgi.kernels.path import PathSettings
 from warpgi.kernels.samples import SampleArrays, trace_samples
 from warpgi.methods.path import NEVER, Sampler
+from warpgi.reconstruction import PrimaryHits
 from warpgi.samples import NO_HIT, SampleBuffer
 from warpgi.scene import Scene
 
-VECTORS = ("origin", "origin_normal", "albedo", "hit", "hit_normal", "radiance")
+PRIMARY = ("origin", "origin_normal", "albedo")
+SECONDARY = ("hit", "hit_normal", "radiance")
 HIT_LIGHT = ("throughput", "hit_direct")
-SAMPLE_BYTES = 12 * len(VECTORS + HIT_LIGHT)
+#: Device bytes of a primary hit, and of a secondary ray beside it.
+PRIMARY_BYTES, SECONDARY_BYTES = 12 * len(PRIMARY), 12 * len(SECONDARY + HIT_LIGHT)
 
 
 def trace_sample_buffer(
     job: Job,
     film: Film,
     spp: int,
+    hits: int,
     light_samples: int,
     max_depth: int,
     roulette_depth: int,
     sampler: Sampler,
     with_hit_light: bool,
-) -> SampleBuffer:
-    """Traces a picture's samples; positions stay relative to the device's origin, other light goes to the film."""
+) -> tuple[SampleBuffer, PrimaryHits]:
+    """Traces a picture's samples; positions stay relative to the device's origin, other light goes to the film.
+
+    The first `spp` of a pixel's `hits` primary hits send secondary rays, which make the buffer; light is to be gathered
+    at all of them.
+    """
     device = job.device
-    count = job.size[0] * job.size[1] * spp
+    pixels = job.size[0] * job.size[1]
     settings = PathSettings()
     settings.max_depth, settings.roulette_depth, settings.seed = max_depth, roulette_depth, job.seed
     settings.sampler = int(rng.SOBOL if sampler is Sampler.SOBOL else rng.INDEPENDENT)
     arrays = SampleArrays()
-    for name in VECTORS + HIT_LIGHT:
-        wanted = name in VECTORS or with_hit_light
-        setattr(arrays, name, device.zeros(count if wanted else 0, wp.vec3))
+    arrays.hits, arrays.spp = hits, spp
+    sizes = dict.fromkeys(PRIMARY, pixels * hits) | dict.fromkeys(SECONDARY, pixels * spp)
+    sizes |= dict.fromkeys(HIT_LIGHT, pixels * spp if with_hit_light else 0)
+    for name, count in sizes.items():
+        setattr(arrays, name, device.zeros(count, wp.vec3))
     for band in film.bands:
-        arrays.first_sample = band.start * spp
-        inputs = [job.scene.struct, job.camera, settings, spp, 0, spp, light_samples]
+        arrays.first_pixel = band.start
+        inputs = [job.scene.struct, job.camera, settings, light_samples]
         device.launch(trace_samples, len(band), inputs, [film.load(band), arrays])
-    names = VECTORS + (HIT_LIGHT if with_hit_light else ())
     # on cpu these are the very arrays, which the buffer keeps alive
-    return SampleBuffer(job.size[0], job.size[1], spp, **{name: getattr(arrays, name).numpy() for name in names})
+    values = {name: getattr(arrays, name).numpy() for name, count in sizes.items() if count}
+    every = PrimaryHits(values["origin"], values["origin_normal"], values["albedo"], hits)
+    if hits > spp:
+        values |= {name: values[name].reshape(pixels, hits, 3)[:, :spp].reshape(-1, 3) for name in PRIMARY}
+    return SampleBuffer(job.size[0], job.size[1], spp, **values), every
 
 
 def sample(
@@ -94,9 +107,11 @@ def sample(
     where = as_device(device)
     where.load([trace_samples])
     on_device = DeviceScene(scene, where)
-    film = Film(size, where, where.memory_limit - on_device.nbytes - size[0] * size[1] * spp * SAMPLE_BYTES)
+    film = Film(
+        size, where, where.memory_limit - on_device.nbytes - size[0] * size[1] * spp * (PRIMARY_BYTES + SECONDARY_BYTES)
+    )
     job = Job(on_device, on_device.camera(size), size, checks.count("seed", seed, 0), where)
-    samples = trace_sample_buffer(job, film, spp, 1, depth, 5, Sampler.SOBOL, recursive)
+    samples, _ = trace_sample_buffer(job, film, spp, spp, 1, depth, 5, Sampler.SOBOL, recursive)
     centre = on_device.centre.astype(np.float32)
     for points in (samples.origin, samples.hit):
         met = np.abs(points).max(axis=1) < NO_HIT

@@ -16,6 +16,10 @@ class Method(Protocol):
     """What `render` asks of a method's settings."""
 
     @property
+    def spp(self) -> int:
+        """Samples per pixel."""
+
+    @property
     def kernels(self) -> tuple[wp.Kernel, ...]:
         """What it launches, to be compiled first."""
 

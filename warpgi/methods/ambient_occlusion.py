@@ -17,7 +17,7 @@ from warpgi.kernels.splats import MAX_NEIGHBOURS
 from warpgi.methods.path import NEVER, Sampler
 from warpgi.reconstruction import BYTES_PER_SAMPLE, KERNELS, Preprocessing, Reconstruction, pixel_means
 from warpgi.samples import SampleBuffer
-from warpgi.sampling import SAMPLE_BYTES, trace_sample_buffer
+from warpgi.sampling import PRIMARY_BYTES, SECONDARY_BYTES, trace_sample_buffer
 
 VISIBILITY_DEPTH = 2  # segments: to the primary hit, and from there to whatever is near
 
@@ -69,11 +69,13 @@ class AmbientOcclusion:
 
     def device_bytes(self, size: tuple[int, int]) -> int:
         """Device memory it takes beside scene and film."""
-        return size[0] * size[1] * self.spp * (SAMPLE_BYTES + BYTES_PER_SAMPLE)
+        return size[0] * size[1] * self.spp * (PRIMARY_BYTES + SECONDARY_BYTES + BYTES_PER_SAMPLE)
 
     def prepare(self, job: Job, film: Film) -> Reconstruction:
         """Traces the input rays and makes splats of their hits."""
-        samples = trace_sample_buffer(job, film, self.spp, 0, VISIBILITY_DEPTH, NEVER, Sampler.SOBOL, False)
+        samples, _ = trace_sample_buffer(
+            job, film, self.spp, self.spp, 0, VISIBILITY_DEPTH, NEVER, Sampler.SOBOL, False
+        )
         return self.reconstruction(samples, job.device, job.seed)
 
     def reconstruction(self, samples: SampleBuffer, device: Device, seed: int) -> Reconstruction:

@@ -15,9 +15,17 @@ from warpgi.kernels.light_field import add_reflected
 from warpgi.kernels.samples import trace_samples
 from warpgi.kernels.splats import MAX_NEIGHBOURS
 from warpgi.methods.path import NEVER, Sampler
-from warpgi.reconstruction import BYTES_PER_SAMPLE, KERNELS, Preprocessing, Reconstruction, pixel_means
+from warpgi.reconstruction import (
+    BYTES_PER_HIT,
+    BYTES_PER_SAMPLE,
+    KERNELS,
+    Preprocessing,
+    PrimaryHits,
+    Reconstruction,
+    pixel_means,
+)
 from warpgi.samples import SampleBuffer
-from warpgi.sampling import SAMPLE_BYTES, trace_sample_buffer
+from warpgi.sampling import PRIMARY_BYTES, SECONDARY_BYTES, trace_sample_buffer
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,8 +57,11 @@ class LightField:
     """Times that the samples' own light is reconstructed first; cures artefacts of noisy samples in corners."""
     recursive_rays: int = 16
     """Reconstruction rays for each sample in that step."""
-    light_samples: int = 4
-    """Shadow rays to lights from each primary hit, which make the direct light."""
+    primary_hits: int | None = None
+    """Primary hits per pixel at which light is gathered, `spp` or more; None is `spp`. More of them make smooth edges,
+    textures and foliage, for the cost of a camera ray each."""
+    light_samples: int = 32
+    """Shadow rays to lights per pixel, shared out over its primary hits, which make the direct light."""
     max_depth: int | None = None
     """Longest path in segments; None is unlimited."""
     roulette_depth: int | None = 5
@@ -68,6 +79,8 @@ class LightField:
         checks.count("recursive", self.recursive, 0)
         checks.count("recursive_rays", self.recursive_rays)
         checks.count("light_samples", self.light_samples)
+        if self.primary_hits is not None:
+            checks.count("primary_hits", self.primary_hits, self.spp)
         if self.max_depth is not None:
             checks.count("max_depth", self.max_depth)
         if self.roulette_depth is not None:
@@ -87,32 +100,47 @@ class LightField:
         """How splats are sized."""
         return Preprocessing(self.neighbours, self.alpha, self.margin, self.lone_radius)
 
-    def passes(self, spp: int | None = None) -> tuple[int, str]:
-        """Reconstruction rays for each primary hit, at `spp` of them in a pixel, and what to call them."""
-        return max(1, round(self.rays / (spp or self.spp))), "rays per hit"
+    @property
+    def hits(self) -> int:
+        """Primary hits per pixel."""
+        return self.primary_hits or self.spp
+
+    def passes(self, hits: int | None = None) -> tuple[int, str]:
+        """Reconstruction rays for each primary hit, at `hits` of them in a pixel, and what to call them."""
+        return max(1, round(self.rays / (hits or self.hits))), "rays per hit"
 
     def device_bytes(self, size: tuple[int, int]) -> int:
         """Device memory it takes beside scene and film."""
-        return size[0] * size[1] * self.spp * (SAMPLE_BYTES + BYTES_PER_SAMPLE)
+        hit, ray = PRIMARY_BYTES + BYTES_PER_HIT, SECONDARY_BYTES + BYTES_PER_SAMPLE
+        return size[0] * size[1] * (self.hits * hit + self.spp * ray)
 
     def prepare(self, job: Job, film: Film) -> Reconstruction:
         """Traces the input, with what is not reconstructed going to the film, and makes splats of it."""
-        samples = trace_sample_buffer(
+        samples, hits = trace_sample_buffer(
             job,
             film,
             self.spp,
-            self.light_samples,
+            self.hits,
+            max(1, self.light_samples // self.hits),
             self.max_depth or NEVER,
             self.roulette_depth or NEVER,
             self.sampler,
             with_hit_light=self.recursive > 0,
         )
-        return self.reconstruction(samples, job.device, job.seed)
+        return self.reconstruction(samples, job.device, job.seed, hits)
 
-    def reconstruction(self, samples: SampleBuffer, device: Device, seed: int) -> Reconstruction:
+    def reconstruction(
+        self, samples: SampleBuffer, device: Device, seed: int, hits: PrimaryHits | None = None
+    ) -> Reconstruction:
         """Splats made of a sample buffer, ready for `gather`."""
         return Reconstruction(
-            samples, device, self.preprocessing, seed, recursions=self.recursive, recursive_rays=self.recursive_rays
+            samples,
+            device,
+            self.preprocessing,
+            seed,
+            hits,
+            recursions=self.recursive,
+            recursive_rays=self.recursive_rays,
         )
 
     def estimate(self, job: Job, state: Reconstruction, film: Film, first: int, count: int) -> None:
@@ -123,7 +151,7 @@ class LightField:
         """Adds the reconstructed light to the film's indirect layer."""
         reflected = state.reflected()
         for band in film.bands:
-            job.device.launch(add_reflected, len(band), [film.load(band), reflected, self.spp])
+            job.device.launch(add_reflected, len(band), [film.load(band), reflected, self.hits])
         return {}
 
     def layers(self, state: Reconstruction) -> dict[str, np.ndarray]:
