@@ -132,7 +132,7 @@ class Stages:
         build = self._since(start)
         tree.size_by_neighbours(rays, how.neighbours, how.alpha)
         knn = self._since(start)
-        tree.shrink(rays, how.margin)
+        tree.shrink(rays, how.margin, state.escaped, state.extent)
         shrink = self._since(start)
         for name, seconds in zip(STAGES, (build, knn - build, shrink - knn), strict=True):
             self.seconds[name].append(seconds)

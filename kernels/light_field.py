@@ -9,6 +9,8 @@ from warpgi.kernels.splats import SplatTree, first_surface, nearest_distance2, s
 
 wp.set_module_options({"enable_backward": False})
 
+FAR = wp.constant(1.0e30)  # beyond any scene
+
 
 @wp.struct
 class Rays:
@@ -78,6 +80,17 @@ def shrink_splats(
 ):
     """One thread retraces one input ray and shrinks, in its slot, the splats that it crosses before its end."""
     retrace(tree, rays, offset + wp.tid(), slot, radius2, margin, noise)
+
+
+@wp.kernel
+def shrink_by_escaped(
+    offset: int, slot: int, tree: SplatTree, rays: Rays, escaped: wp.array[int], margin: float, radius2: wp.array[float]
+):
+    """One thread retraces one input ray that left the scene and shrinks what it crosses."""
+    j = escaped[offset + wp.tid()]
+    o = rays.origins[j]
+    d = wp.normalize((rays.hits[j] - o) * 1.0e-11)  # the squares of its coordinates may be beyond float32
+    shrink_crossed(tree, o, d, 0.1 * FAR, margin, -1, slot, radius2)
 
 
 @wp.kernel

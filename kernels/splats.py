@@ -292,27 +292,30 @@ SURFACE = (
                 if (skip)
                     continue;
                 if (size == 64) {
-                    // forget what lies behind the limit; if nothing does, the farthest ends the surface
-                    int farthest = 0;
-                    for (int j = 1; j < 64; ++j)
-                        farthest = t_of[j] > t_of[farthest] ? j : farthest;
-                    if (t_of[farthest] < limit) {
-                        cut = 1;
-                        limit = t_of[farthest];
-                        if (t[k] >= limit)
-                            continue;
-                    }
-                    int kept = 0;
+                    // forget what lies behind the limit
+                    int kept = 0, farthest = 0;
                     for (int j = 0; j < 64; ++j) {
                         if (t_of[j] < limit) {
                             hx[kept] = hx[j]; hy[kept] = hy[j]; hz[kept] = hz[j];
                             gx[kept] = gx[j]; gy[kept] = gy[j]; gz[kept] = gz[j];
                             depth[kept] = depth[j]; t_of[kept] = t_of[j]; e_of[kept] = e_of[j];
                             place[kept] = place[j];
+                            farthest = t_of[kept] > t_of[farthest] ? kept : farthest;
                             ++kept;
                         }
                     }
                     size = kept;
+                    if (size == 64) {
+                        // nothing does: the nearest 64 stand for the surface
+                        cut = 1;
+                        if (t[k] >= t_of[farthest])
+                            continue;
+                        --size;
+                        hx[farthest] = hx[size]; hy[farthest] = hy[size]; hz[farthest] = hz[size];
+                        gx[farthest] = gx[size]; gy[farthest] = gy[size]; gz[farthest] = gz[size];
+                        depth[farthest] = depth[size]; t_of[farthest] = t_of[size]; e_of[farthest] = e_of[size];
+                        place[farthest] = place[size];
+                    }
                 }
                 const float px = p[k], py = p[8 + k], pz = p[16 + k];
                 const float nx = p[24 + k], ny = p[32 + k], nz = p[40 + k];
@@ -382,7 +385,7 @@ SURFACE = (
             g += w * q[64];
             b += w * q[72];
             weight += w;
-            within += depth[j] < reach ? w : 0.0f;
+            within += t_of[j] < reach ? w : 0.0f;
         }
     }
     wp::vec_t<8, wp::float32> result;

@@ -15,6 +15,8 @@ from warpgi.splat_tree import LANES, SplatTree
 
 wp.set_module_options({"enable_backward": False})
 
+NO_RAYS = np.zeros(0, np.int32)  # none left the scene
+
 STRETCH = 3.0**2 - 1.0  # alpha = 3: |d|^2 + (alpha^2 - 1) (d.n)^2
 ALL_SIDES = [(0, 1, 2), (1, 2, 0), (2, 0, 1)]
 
@@ -32,9 +34,9 @@ def look(
     reach: float,
     result: wp.array[vec8],
 ):
-    """One thread owns one ray."""
+    """One thread owns one ray; splats alone, or two, keep 1/2 and 2/3 of their radius, as in section 2.5."""
     i = offset + wp.tid()
-    result[i] = first_surface(tree, origins[i], directions[i], noise, reach)
+    result[i] = first_surface(tree, origins[i], directions[i], noise, reach, 0.25, 4.0 / 9.0)
 
 
 class Splats:
@@ -262,7 +264,7 @@ def test_shrinking_is_the_least_over_all_crossing_rays(margin):
     assert sure.mean() > 0.6 and (expected < before).mean() > 0.5
     # a hundredth of the crossings may go either way in float32
     assert splats.tree.count_crossed(rays, margin) == pytest.approx(total, rel=0.01)
-    splats.tree.shrink(rays, margin)
+    splats.tree.shrink(rays, margin, NO_RAYS, 1.0)
     after = splats.radii().astype(np.float64) ** 2
     np.testing.assert_allclose(after[sure], expected[sure], rtol=1e-3, atol=1e-6 * before.mean())
 
@@ -281,7 +283,7 @@ def test_no_input_ray_is_occluded_after_shrinking(count):
     splats.tree.size_by_neighbours(rays, 12, 3.0)
     before = splats.radii()
     assert splats.tree.count_crossed(rays, 1e-3) > 0
-    splats.tree.shrink(rays, 1e-3)
+    splats.tree.shrink(rays, 1e-3, NO_RAYS, 1.0)
     assert splats.tree.count_crossed(rays, 1e-3) == 0
     assert (splats.radii() <= before).all() and (splats.radii() < before).any()
 
@@ -295,7 +297,7 @@ def test_shrinking_does_not_depend_on_threads():
         splats = Splats(points, normals, device=device)
         rays = splats.rays(origins)
         splats.tree.size_by_neighbours(rays, 12, 3.0)
-        splats.tree.shrink(rays, 1e-3)
+        splats.tree.shrink(rays, 1e-3, NO_RAYS, 1.0)
         results.append(splats.radii().view("u4"))
     np.testing.assert_array_equal(results[0], results[1])
     np.testing.assert_array_equal(results[0], results[2])
@@ -547,7 +549,7 @@ def test_order_of_samples_does_not_matter():
         splats = Splats(points[order], normals[order], radiance[order])
         rays = splats.rays(origins[order])
         splats.tree.size_by_neighbours(rays, 12, 3.0)
-        splats.tree.shrink(rays, 1e-3)
+        splats.tree.shrink(rays, 1e-3, NO_RAYS, 1.0)
         results.append(splats.look(eyes, directions))
         sizes.append(splats.radii()[np.argsort(order)])
     np.testing.assert_array_equal(sizes[0], sizes[1])  # a least value has no order

@@ -103,8 +103,9 @@ class Reconstruction:
         rays.origins, rays.hits, rays.order = self._origins, self._hits, self.tree.order
         self.rays, self.preprocessing = rays, preprocessing
         self.tree.size_by_neighbours(rays, preprocessing.neighbours, preprocessing.alpha)
-        self.tree.shrink(rays, preprocessing.margin)
-        self.sky = self._sky(np.flatnonzero(state.is_escaped))
+        self.escaped = np.flatnonzero(state.is_escaped).astype(np.int32)
+        self.tree.shrink(rays, preprocessing.margin, self.escaped, self.extent)
+        self.sky = self._sky(self.escaped)
         self.counts = {name: count for name, count in state.counts.items() if name != "primary_missed"}
         self.counts |= {"splats": len(splats), "reconstruction_rays": 0}
         for _ in range(recursions):
@@ -145,6 +146,7 @@ class Reconstruction:
         used = samples.hit[splats] if len(splats) else np.zeros((1, 3), np.float32)
         low, high = used.min(axis=0), used.max(axis=0)
         centre = 0.5 * (low + high)
+        self.extent = float((high - low).max())  # of the splats
         self.noise = NOISE_ULPS * max(float(np.abs(low).max()), float(np.abs(high).max()), 1e-30)
         with np.errstate(invalid="ignore", over="ignore"):
             self._origins = device.array(samples.origin - centre, wp.vec3)

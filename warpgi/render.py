@@ -75,7 +75,7 @@ def render(
     size = checks.image_size(size)
     seed = checks.count("seed", seed, 0)
     where = as_device(device)
-    if not scene.has_light():
+    if method.needs_light and not scene.has_light():
         warnings.warn("the scene has no light: the picture is black", stacklevel=2)
 
     timings = Timings()

@@ -19,7 +19,7 @@ class SplatTree:
     Args:
         device: where it lives.
         hits, normals, radiance: of all samples, vec3 arrays on the device.
-        splats: which samples are splats, int array on the host, at least one.
+        splats: which samples are splats, int array on the host.
         noise: rounding of the positions.
 
     Attributes:
@@ -39,7 +39,7 @@ class SplatTree:
         self.device = device
         self.noise = noise
         self.count = len(splats)
-        self.block_count = -(-self.count // LANES)
+        self.block_count = max(1, -(-self.count // LANES))  # of an empty tree all lanes are unused
         self.order = self._hilbert_order(hits, splats)
         self._lay_out_levels()
         struct = SplatTreeStruct()
@@ -61,6 +61,8 @@ class SplatTree:
     def _hilbert_order(self, hits: wp.array, splats: np.ndarray) -> wp.array:
         device, count = self.device, self.count
         source = device.array(splats, int)
+        if count == 0:
+            return source
         # the bounds of what is a splat, found on the host: the samples came from there
         points = hits.numpy()[splats]
         low, high = points.min(axis=0), points.max(axis=0)
@@ -96,19 +98,28 @@ class SplatTree:
 
     def size_by_neighbours(self, rays: kernels.Rays, k: int, alpha: float) -> None:
         """Radii from the k-th nearest neighbour (Lehtinen et al. 2012, section 2.2)."""
+        if self.count == 0:
+            return
         radius2 = self.device.zeros(self.count, float)
         # |d + (alpha - 1) (d.n) n|^2 = |d|^2 + (alpha^2 - 1) (d.n)^2
         self.device.launch(kernels.size_splats, self.count, [self.struct, rays, k, alpha * alpha - 1.0], [radius2])
         self._set_radii(radius2, 1)
 
-    def shrink(self, rays: kernels.Rays, margin: float) -> None:
-        """Shrinks what input rays cross (section 2.3.1); the same for any number of threads."""
+    def shrink(self, rays: kernels.Rays, margin: float, escaped: np.ndarray, extent: float) -> None:
+        """Shrinks what input rays cross (section 2.3.1); the same for any number of threads.
+
+        Rays that left the scene are known visibility too: `escaped` are their samples, `extent` stands for a length.
+        """
+        if self.count == 0:
+            return
         slots = self.device.slots
         radius2 = wp.full(slots * self.count, 3.0e38, dtype=float, device=self.device.warp)
         own = radius2[: self.count]
         self.device.launch(bvh.read_radii, self.count, [self.struct.blocks], [own])
         inputs = [self.struct, rays, margin, self.noise]
         self.device.launch(kernels.shrink_splats, self.count, inputs, [radius2], with_slot=True)
+        inputs = [self.struct, rays, self.device.array(escaped, int), max(margin * extent, self.noise)]
+        self.device.launch(kernels.shrink_by_escaped, len(escaped), inputs, [radius2], with_slot=True)
         self._set_radii(radius2, slots)
 
     def count_crossed(self, rays: kernels.Rays, margin: float) -> int:

@@ -20,6 +20,10 @@ class Method(Protocol):
         """Samples per pixel."""
 
     @property
+    def needs_light(self) -> bool:
+        """Whether the picture of a scene without light is black."""
+
+    @property
     def kernels(self) -> tuple[wp.Kernel, ...]:
         """What it launches, to be compiled first."""
 

@@ -59,6 +59,11 @@ class AmbientOcclusion:
         checks.number("lone_radius", self.lone_radius, 0.0, 1.0, open_lower=True)
 
     @property
+    def needs_light(self) -> bool:
+        """Whether the picture of a scene without light is black."""
+        return False
+
+    @property
     def kernels(self) -> tuple[wp.Kernel, ...]:
         """What it launches."""
         return (trace_samples, *KERNELS)

@@ -91,6 +91,11 @@ class LightField:
             raise TypeError(f"sampler is {self.sampler!r}, expected a Sampler")
 
     @property
+    def needs_light(self) -> bool:
+        """Whether the picture of a scene without light is black."""
+        return True
+
+    @property
     def kernels(self) -> tuple[wp.Kernel, ...]:
         """What it launches."""
         return (trace_samples, *KERNELS)

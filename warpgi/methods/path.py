@@ -58,6 +58,11 @@ class PathTracing:
             raise TypeError(f"sampler is {self.sampler!r}, expected a Sampler")
 
     @property
+    def needs_light(self) -> bool:
+        """Whether the picture of a scene without light is black."""
+        return True
+
+    @property
     def kernels(self) -> tuple[wp.Kernel, ...]:
         """What it launches."""
         return (trace_paths,)
