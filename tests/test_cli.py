@@ -76,6 +76,17 @@ def test_compare(tmp_path, capsys):
             assert float(values[name]) == pytest.approx(value, rel=1e-4)
 
 
+def test_reconstruct_makes_the_picture_of_the_library(tmp_path, capsys):
+    """`warpgi reconstruct` writes what `gi.reconstruct` gives for the same file and settings."""
+    path, out = tmp_path / "samples.bin", tmp_path / "a.exr"
+    gi.sample(gi.scenes.cornell_box(), spp=2, size=(12, 8)).save(path)
+    status, text, _ = run("reconstruct", path, "light-field", "--rays", 16, "--seed", 3, "--out", out, capsys=capsys)
+    assert status == 0
+    assert "light-field, 2 spp, 12 x 8" in text
+    expected = gi.reconstruct(gi.SampleBuffer.load(path), gi.LightField(rays=16), seed=3)
+    np.testing.assert_array_equal(gi.Render.load(out).layers["indirect"], expected.layers["indirect"])
+
+
 def test_lists(capsys):
     """`scenes`, `methods` and `info` name all there is."""
     for command, names in (("scenes", gi.scenes.SCENES), ("methods", gi.METHODS), ("info", gi.versions())):
@@ -102,6 +113,9 @@ def test_lists(capsys):
         (("render", "cornell-box", "--out", "x.jpg"), "x.jpg"),
         (("render", "cornell-box", "--out", "missing/x.png"), "missing"),
         (("compare", "missing.exr", "missing.exr"), "missing.exr"),
+        (("reconstruct", "missing.bin"), "missing.bin does not exist"),
+        (("reconstruct", "missing.bin", "--out", "x.gif"), "x.gif"),
+        (("render", "cornell-box", "light-field", "--size", "3000", "3000", "--memory-limit", "0.1"), "memory_limit"),
     ],
 )
 def test_mistakes_end_with_one_sentence(arguments, message, capsys, tmp_path, monkeypatch):

@@ -45,7 +45,7 @@ class Film:
         band = min(self.pixel_count, free_bytes // BYTES_PER_PIXEL)
         if band < 1:
             raise ValueError(
-                f"memory_limit is {device.memory_limit} bytes, expected enough for the scene and one pixel,"
+                f"memory_limit is {device.memory_limit} bytes, expected enough for scene, method and a pixel,"
                 f" {device.memory_limit - free_bytes + BYTES_PER_PIXEL} bytes"
             )
         self.device = device

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass, field, fields
 from functools import cached_property, reduce
 from typing import Any, NamedTuple
@@ -273,6 +274,8 @@ class SampleBuffer:
             FileNotFoundError: there is no such file.
             ValueError: the header cannot be read, or the data is not what it announces.
         """
+        if not os.path.isfile(path):
+            raise FileNotFoundError(f"{os.fspath(path)} does not exist, expected a sample buffer")
         header, channels = samples_file.read(path)
         known: dict[str, Any] = {"width": header.width, "height": header.height, "spp": header.spp, "coc": header.coc}
         if header.version < 2.0:
