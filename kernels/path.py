@@ -127,6 +127,16 @@ def trace_path(
     return path
 
 
+@wp.func
+def pixel_ray(camera: Camera, sampler: Sampler, pixel: int):
+    """Camera ray through a random point of a pixel, and of the lens if there is one."""
+    u = sample_2d(sampler, 0)
+    lens = wp.vec2(0.0)
+    if camera.lens_radius > 0.0:
+        lens = sample_2d(sampler, 1)
+    return camera_ray(camera, float(pixel % camera.width) + u[0], float(pixel // camera.width) + u[1], lens)
+
+
 @wp.kernel
 def trace_paths(
     offset: int,
@@ -140,13 +150,7 @@ def trace_paths(
     """One thread owns one pixel: `sample_count` paths from `first_sample` on, folded into `film`."""
     i = offset + wp.tid()
     pixel = film.first_pixel + i
-    x = float(pixel % camera.width)
-    y = float(pixel // camera.width)
     for index in range(first_sample, first_sample + sample_count):
         sampler = make_sampler(settings.seed, pixel, index, settings.sampler)
-        u = sample_2d(sampler, 0)
-        lens = wp.vec2(0.0)
-        if camera.lens_radius > 0.0:
-            lens = sample_2d(sampler, 1)
-        ray = camera_ray(camera, x + u[0], y + u[1], lens)
+        ray = pixel_ray(camera, sampler, pixel)
         add_sample(film, i, trace_path(scene, settings, sampler, CAMERA_PAIRS, ray.o, ray.d, 0.0))

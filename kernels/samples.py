@@ -3,10 +3,10 @@
 import warp as wp
 
 from warpgi.kernels.bsdf import sample
-from warpgi.kernels.camera import Camera, camera_ray
+from warpgi.kernels.camera import Camera
 from warpgi.kernels.direct import add_features, direct_light, emitted, facing_normal, reflects
 from warpgi.kernels.film import Film, PathSample, add_sample
-from warpgi.kernels.path import CAMERA_PAIRS, VERTEX_PAIRS, PathSettings, add_light, trace_path
+from warpgi.kernels.path import CAMERA_PAIRS, VERTEX_PAIRS, PathSettings, add_light, pixel_ray, trace_path
 from warpgi.kernels.rng import make_sampler, sample_2d
 from warpgi.kernels.scene import (
     DIELECTRIC,
@@ -61,8 +61,6 @@ def trace_samples(
     i = offset + wp.tid()
     light_share = 1.0 / float(wp.max(light_samples, 1))
     pixel = film.first_pixel + i
-    x = float(pixel % camera.width)
-    y = float(pixel // camera.width)
     for index in range(samples.hits):
         place = (samples.first_pixel + i) * samples.hits + index
         k = (samples.first_pixel + i) * samples.spp + index
@@ -70,11 +68,7 @@ def trace_samples(
         if index < samples.spp:
             samples.hit[k] = wp.vec3(NO_HIT)
         sampler = make_sampler(settings.seed, pixel, index, settings.sampler)
-        u = sample_2d(sampler, 0)
-        lens = wp.vec2(0.0)
-        if camera.lens_radius > 0.0:
-            lens = sample_2d(sampler, 1)
-        ray = camera_ray(camera, x + u[0], y + u[1], lens)
+        ray = pixel_ray(camera, sampler, pixel)
         path = PathSample()
         path.depth = -1.0
         throughput = wp.vec3(1.0)
