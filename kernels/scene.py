@@ -31,7 +31,6 @@ class ShapeRecord:
     two_sided: int  # 1: emits on both sides
     light_pdf: float  # density per area with which light sampling picks a point here
     has_normals: int
-    has_uv: int
 
 
 @wp.struct

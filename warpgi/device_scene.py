@@ -195,7 +195,6 @@ class DeviceScene:
             record.two_sided = int(shape.emission.two_sided)
             record.light_pdf = light_pdf
         record.has_normals = int(shape.normals is not None)
-        record.has_uv = int(shape.uv is not None)
         return record
 
 

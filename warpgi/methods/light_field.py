@@ -14,7 +14,7 @@ from warpgi.job import Job
 from warpgi.kernels.light_field import add_reflected
 from warpgi.kernels.samples import trace_samples
 from warpgi.kernels.splats import MAX_NEIGHBOURS
-from warpgi.methods.path import NEVER, Sampler
+from warpgi.methods.path import NEVER, Sampler, check_paths
 from warpgi.reconstruction import (
     BYTES_PER_HIT,
     BYTES_PER_SAMPLE,
@@ -81,14 +81,7 @@ class LightField:
         checks.count("light_samples", self.light_samples)
         if self.primary_hits is not None:
             checks.count("primary_hits", self.primary_hits, self.spp)
-        if self.max_depth is not None:
-            checks.count("max_depth", self.max_depth)
-        if self.roulette_depth is not None:
-            checks.count("roulette_depth", self.roulette_depth)
-        if self.max_depth is None and self.roulette_depth is None:
-            raise ValueError("max_depth and roulette_depth are both None, expected one of them, or paths never end")
-        if not isinstance(self.sampler, Sampler):
-            raise TypeError(f"sampler is {self.sampler!r}, expected a Sampler")
+        check_paths(self.max_depth, self.roulette_depth, self.sampler)
 
     @property
     def needs_light(self) -> bool:

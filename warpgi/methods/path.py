@@ -27,6 +27,22 @@ class Sampler(Enum):
 NEVER = 2**31 - 1
 
 
+def check_paths(max_depth: int | None, roulette_depth: int | None, sampler: Sampler) -> None:
+    """Refuses settings of paths that are out of range, and paths that would never end.
+
+    Raises:
+        TypeError, ValueError: they are such.
+    """
+    if max_depth is not None:
+        checks.count("max_depth", max_depth)
+    if roulette_depth is not None:
+        checks.count("roulette_depth", roulette_depth)
+    if max_depth is None and roulette_depth is None:
+        raise ValueError("max_depth and roulette_depth are both None, expected one of them, or paths never end")
+    if not isinstance(sampler, Sampler):
+        raise TypeError(f"sampler is {sampler!r}, expected a Sampler")
+
+
 @dataclass(frozen=True, kw_only=True)
 class PathTracing:
     """Path tracing (Kajiya 1986) with multiple importance sampling (Veach 1997); unbiased at any setting of roulette.
@@ -48,14 +64,7 @@ class PathTracing:
 
     def __post_init__(self) -> None:
         checks.count("spp", self.spp)
-        if self.max_depth is not None:
-            checks.count("max_depth", self.max_depth)
-        if self.roulette_depth is not None:
-            checks.count("roulette_depth", self.roulette_depth)
-        if self.max_depth is None and self.roulette_depth is None:
-            raise ValueError("max_depth and roulette_depth are both None, expected one of them, or paths never end")
-        if not isinstance(self.sampler, Sampler):
-            raise TypeError(f"sampler is {self.sampler!r}, expected a Sampler")
+        check_paths(self.max_depth, self.roulette_depth, self.sampler)
 
     @property
     def needs_light(self) -> bool:
