@@ -22,6 +22,8 @@ class Film:
     normal: wp.array[wp.vec3]
     position: wp.array[wp.vec3]  # mean over `surface_count`, relative to the scene's centre
     depth: wp.array[float]  # likewise
+    ray_count: wp.array[int]  # finite samples that sent a ray on from the first hit
+    inverse_distance: wp.array[float]  # mean over `ray_count` of one over the distance to what it met, 0 for nothing
     closest_hit_rays: wp.array[int]
     shadow_rays: wp.array[int]
     nonfinite: wp.array[int]  # dropped samples
@@ -36,6 +38,8 @@ class PathSample:
     normal: wp.vec3
     position: wp.vec3
     depth: float  # distance along the camera ray, below 0: nothing was met
+    has_ray: int  # 1: a ray went on from the first hit
+    inverse_distance: float  # one over its length, 0: it met nothing
     closest_hit_rays: int
     shadow_rays: int
 
@@ -76,3 +80,7 @@ def add_sample(film: Film, i: int, s: PathSample):
         film.surface_count[i] = m
         film.position[i] = film.position[i] + (s.position - film.position[i]) / float(m)
         film.depth[i] = film.depth[i] + (s.depth - film.depth[i]) / float(m)
+    if s.has_ray != 0:
+        k = film.ray_count[i] + 1
+        film.ray_count[i] = k
+        film.inverse_distance[i] = film.inverse_distance[i] + (s.inverse_distance - film.inverse_distance[i]) / float(k)

@@ -48,6 +48,12 @@ def add_light(path: PathSample, depth: int, radiance: wp.vec3):
 
 
 @wp.func
+def inverse_distance(t: float):
+    """One over a hit's distance, bounded where a ray meets something at its very start."""
+    return 1.0 / wp.max(t, 1.0e-20)
+
+
+@wp.func
 def trace_path(
     scene: Scene,
     settings: PathSettings,
@@ -82,6 +88,8 @@ def trace_path(
         wo = -d
         if depth == 1:
             path = add_features(path, s, wo, hit.t)
+        elif depth == 2:
+            path.inverse_distance = inverse_distance(hit.t)
 
         # emission
         le = emitted(shape, s.ng, wo)
@@ -124,6 +132,7 @@ def trace_path(
         o = offset_origin(s.p, s.ng, s.offset, b.wi)
         d = b.wi
         depth = depth + 1
+        path.has_ray = 1
     return path
 
 

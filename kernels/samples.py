@@ -6,7 +6,15 @@ from warpgi.kernels.bsdf import sample
 from warpgi.kernels.camera import Camera
 from warpgi.kernels.direct import add_features, direct_light, emitted, facing_normal, reflects
 from warpgi.kernels.film import Film, PathSample, add_sample
-from warpgi.kernels.path import CAMERA_PAIRS, VERTEX_PAIRS, PathSettings, add_light, pixel_ray, trace_path
+from warpgi.kernels.path import (
+    CAMERA_PAIRS,
+    VERTEX_PAIRS,
+    PathSettings,
+    add_light,
+    inverse_distance,
+    pixel_ray,
+    trace_path,
+)
 from warpgi.kernels.rng import make_sampler, sample_2d
 from warpgi.kernels.scene import (
     DIELECTRIC,
@@ -87,6 +95,8 @@ def trace_samples(
             wo = -d
             if depth == 1:
                 path = add_features(path, s, wo, hit.t)
+            elif depth == 2:
+                path.inverse_distance = inverse_distance(hit.t)
             path = add_light(path, depth, wp.cw_mul(throughput, emitted(shape, s.ng, wo)))
             if depth >= settings.max_depth or depth > MAX_CHAIN:
                 break
@@ -123,6 +133,7 @@ def trace_samples(
             o = offset_origin(s.p, s.ng, s.offset, b.wi)
             d = b.wi
             if delta:
+                path.has_ray = 1
                 throughput = wp.cw_mul(throughput, b.weight)
                 depth = depth + 1
             elif not has_ray:
@@ -141,6 +152,9 @@ def trace_samples(
                 gathered = trace_path(
                     scene, rest, sampler, CAMERA_PAIRS + VERTEX_PAIRS * depth, o, d, b.pdf * light_share
                 )
+                path.has_ray = 1
+                if depth == 1 and gathered.depth >= 0.0:
+                    path.inverse_distance = inverse_distance(gathered.depth)
                 path.closest_hit_rays = path.closest_hit_rays + gathered.closest_hit_rays
                 path.shadow_rays = path.shadow_rays + gathered.shadow_rays
                 weight = wp.cw_mul(throughput, b.weight)

@@ -4,11 +4,21 @@ __version__ = "0.1.0"
 
 from warpgi import scenes  # type: ignore[attr-defined]
 from warpgi.camera import Camera
+from warpgi.denoise import denoise
 from warpgi.device import Device
 from warpgi.lights import DistantLight, Environment, PointLight, SpotLight
 from warpgi.load import load_scene
 from warpgi.materials import Conductor, Dielectric, Diffuse, Emissive, Mirror, Texture
-from warpgi.methods import METHODS, AmbientOcclusion, LightField, PathTracing, Sampler
+from warpgi.methods import (
+    METHODS,
+    AmbientOcclusion,
+    ATrous,
+    IrradianceFilter,
+    LightField,
+    PathTracing,
+    RandomParameterFilter,
+    Sampler,
+)
 from warpgi.metrics import compare
 from warpgi.progress import Progress
 from warpgi.reconstruct import reconstruct
@@ -20,6 +30,7 @@ from warpgi.scene import Scene, Shape
 
 __all__ = [
     "METHODS",
+    "ATrous",
     "AmbientOcclusion",
     "Camera",
     "Conductor",
@@ -30,11 +41,13 @@ __all__ = [
     "Emissive",
     "Environment",
     "Interrupted",
+    "IrradianceFilter",
     "LightField",
     "Mirror",
     "PathTracing",
     "PointLight",
     "Progress",
+    "RandomParameterFilter",
     "Render",
     "SampleBuffer",
     "Sampler",
@@ -43,6 +56,7 @@ __all__ = [
     "SpotLight",
     "Texture",
     "compare",
+    "denoise",
     "load_scene",
     "reconstruct",
     "render",

@@ -17,6 +17,8 @@ import tyro
 import warpgi as gi
 from warpgi.image import check_output
 from warpgi.load import SUFFIXES
+from warpgi.methods import DENOISERS as DENOISING_METHODS
+from warpgi.methods import RECONSTRUCTIONS as RECONSTRUCTION_METHODS
 from warpgi.progress import RAY_KINDS
 
 MISUSE = 2  # exit status for a caller's mistake
@@ -25,6 +27,7 @@ INTERRUPTED = 130
 # Counts of what a user should hear of.
 WRONG = {
     "nonfinite": "samples were not finite and were dropped",
+    "nonfinite_input": "pixels or samples were not finite and were left out",
     "zero_length": "samples had no length and were dropped",
     "bad_normal": "samples had no normal and were dropped",
     "degenerate_triangles": "triangles without area were dropped",
@@ -42,7 +45,8 @@ def _subcommands(methods: Mapping[str, type]) -> Any:
 
 
 METHOD_SETTINGS: Any = _subcommands(gi.METHODS)
-RECONSTRUCTIONS: Any = _subcommands({name: kind for name, kind in gi.METHODS.items() if hasattr(kind, "layers")})
+RECONSTRUCTIONS: Any = _subcommands(RECONSTRUCTION_METHODS)
+DENOISERS: Any = _subcommands(DENOISING_METHODS)
 
 
 @dataclass(frozen=True)
@@ -110,6 +114,35 @@ class ReconstructCommand:
 
 
 @dataclass(frozen=True)
+class DenoiseCommand:
+    """Filter the indirect light of a finished picture, or all of it; any renderer's that has feature layers."""
+
+    picture: tyro.conf.Positional[Path]
+    """The .exr to filter, with layers for albedo, normal, and position or depth."""
+    method: DENOISERS = field(default_factory=gi.ATrous)  # type: ignore[valid-type]
+    """The filter: À-Trous by default."""
+    out: tyro.conf.UseAppendAction[tuple[Path, ...]] = ()
+    """Where the picture goes: .exr with all layers, .png tone-mapped; may be given more than once."""
+    exposure: float = 0.0
+    """Stops by which a .png is brightened."""
+    device: str | None = None
+    """cpu, cuda:0, ...; a GPU if there is one."""
+    threads: int | None = None
+    """CPU threads; all by default."""
+    memory_limit: float = 3.0
+    """GiB that the arrays may take on the device."""
+
+    def run(self) -> None:
+        device = _prepare(self.out, self.device, self.threads, self.memory_limit)
+        picture = gi.Render.load(self.picture)
+
+        def work() -> gi.Render:
+            return gi.denoise(picture, self.method, device, progress=sys.stderr.isatty())
+
+        _make(work, self.out, self.exposure)
+
+
+@dataclass(frozen=True)
 class CompareCommand:
     """Compare two pictures of one size: relMSE, RMSE, PSNR and FLIP."""
 
@@ -161,6 +194,7 @@ class InfoCommand:
 COMMANDS = (
     Annotated[RenderCommand, tyro.conf.subcommand("render")]
     | Annotated[ReconstructCommand, tyro.conf.subcommand("reconstruct")]
+    | Annotated[DenoiseCommand, tyro.conf.subcommand("denoise")]
     | Annotated[CompareCommand, tyro.conf.subcommand("compare")]
     | Annotated[ScenesCommand, tyro.conf.subcommand("scenes")]
     | Annotated[MethodsCommand, tyro.conf.subcommand("methods")]
@@ -225,7 +259,8 @@ def _keep(picture: gi.Render, out: tuple[Path, ...], exposure: float) -> None:
     rays = {kind: picture.counts[kind] for kind in RAY_KINDS if kind in picture.counts}
     seconds = picture.timings["prepare"] + picture.timings["estimate"]
     kinds = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in rays.items())
-    print(f"{kinds}: {sum(rays.values()) / max(seconds, 1e-9) / 1e6:.2f} M rays/s")
+    if rays:
+        print(f"{kinds}: {sum(rays.values()) / max(seconds, 1e-9) / 1e6:.2f} M rays/s")
     for kind, meaning in WRONG.items():
         if picture.counts.get(kind):
             _warn(f"{picture.counts[kind]} {meaning}")

@@ -20,6 +20,8 @@ FIELDS = {
     "normal": wp.vec3,
     "position": wp.vec3,
     "depth": float,
+    "ray_count": int,
+    "inverse_distance": float,
     "closest_hit_rays": int,
     "shadow_rays": int,
     "nonfinite": int,
@@ -106,6 +108,8 @@ class Film:
         position = np.where(met, self.field("position") + centre, 0.0).astype(np.float32)
         layers["position"] = position.reshape(self.height, self.width, 3)
         layers["depth"] = np.where(met[:, 0], self.field("depth"), np.float32(0.0)).reshape(self.height, self.width, 1)
+        inverse = self.field("inverse_distance").reshape(self.height, self.width, 1)
+        layers["hit_distance"] = np.divide(1.0, inverse, out=np.zeros_like(inverse), where=inverse > 0)
         count = self.field("count")[:, None].astype(np.float64)
         # one sample tells nothing of its variance
         variance = np.where(count > 1, self.field("squares") / np.maximum(count * (count - 1), 1.0), 0.0)

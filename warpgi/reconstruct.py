@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from warpgi import checks
 from warpgi.device import Device, as_device
-from warpgi.methods import AmbientOcclusion, LightField
+from warpgi.filtering import SampleFilter, hit_distance
+from warpgi.methods import RECONSTRUCTIONS, AmbientOcclusion, LightField
 from warpgi.passes import Passes
 from warpgi.progress import Progress, progress_bar
 from warpgi.reconstruction import pixel_means
@@ -20,12 +22,12 @@ from warpgi.timing import Timings
 
 def reconstruct(
     samples: SampleBuffer,
-    method: LightField | AmbientOcclusion | None = None,
+    method: LightField | AmbientOcclusion | SampleFilter | None = None,
     seed: int = 0,
     device: str | Device | None = None,
     progress: bool | Callable[[Progress], None] = False,
 ) -> Render:
-    """Reconstructs indirect light, or ambient occlusion, from a sample buffer; no scene is needed.
+    """Reconstructs or filters indirect light, or ambient occlusion, from a sample buffer; no scene is needed.
 
     Args:
         samples: the input, from `sample`, a file or any other renderer.
@@ -35,8 +37,9 @@ def reconstruct(
         progress: True shows a bar on standard error; a function gets a `Progress` after every pass.
 
     Returns:
-        Layers "indirect" (or "image" for ambient occlusion), "albedo", "normal", "position", and "direct" where the
-        samples hold it. `counts` says how many samples could not be used and how many rays found no support.
+        Layers "indirect" (or "image" for ambient occlusion), "albedo", "normal", "position", "hit_distance", and
+        "direct" where the samples hold it. `counts` says how many samples could not be used and how many rays found no
+        support.
 
     Raises:
         TypeError, ValueError: an argument is wrong; nothing has been computed then.
@@ -51,19 +54,21 @@ def reconstruct(
     method = LightField() if method is None else method
     if not isinstance(samples, SampleBuffer):
         raise TypeError(f"samples is {type(samples).__name__}, expected SampleBuffer")
-    if not isinstance(method, (LightField, AmbientOcclusion)):
-        raise TypeError(f"method is {type(method).__name__}, expected LightField or AmbientOcclusion")
+    if not isinstance(method, tuple(RECONSTRUCTIONS.values())):
+        *names, last = (kind.__name__ for kind in RECONSTRUCTIONS.values())
+        raise TypeError(f"method is {type(method).__name__}, expected {', '.join(names)} or {last}")
+    chosen: Any = method  # its state is its own affair
     checks.count("seed", seed, 0)
     where = as_device(device)
     timings = Timings()
     with timings.stage("compile"):
-        where.load(method.kernels)
+        where.load(chosen.kernels)
     spp = samples.spp or max(1, round(len(samples) / (samples.width * samples.height)))
-    passes = Passes(*method.passes(spp))
+    passes = Passes(*chosen.passes(spp))
     interrupted = False
     try:
         with timings.stage("prepare"):
-            state = method.reconstruction(samples, where, seed)
+            state = chosen.reconstruction(samples, where, seed)
             where.synchronize()
         with timings.stage("estimate"), progress_bar(progress) as report:
             passes.run(lambda first, count: state.gather(first, count, passes.total), where, report, state.all_counts)
@@ -72,8 +77,8 @@ def reconstruct(
             raise Interrupted(None, passes) from None
         interrupted = True
     with timings.stage("image"):
-        layers = _layers(samples) | method.layers(state)
-        render = Render(layers, dict(timings), state.all_counts(), spp=spp, **provenance(method, seed, where))
+        layers = _layers(samples) | chosen.layers(state)
+        render = Render(layers, dict(timings), state.all_counts(), spp=spp, **provenance(chosen, seed, where))
     render.timings["image"] = timings["image"]
     if interrupted:
         raise Interrupted(render, passes)
@@ -91,4 +96,5 @@ def _layers(samples: SampleBuffer) -> dict[str, np.ndarray]:
     share = pixel_means(samples, np.repeat(primary[:, None].astype(np.float32), 3, axis=1))
     position = pixel_means(samples, np.where(primary[:, None], samples.origin, zero))
     layers["position"] = position / np.where(share > 0, share, np.float32(1.0))
+    layers["hit_distance"] = hit_distance(samples)
     return layers

@@ -72,6 +72,11 @@ LAYERS: Mapping[str, Layer] = {
         ("depth", "denoising depth", "dd", "dd.y", ""),
         ("Z", "T", "V"),
     ),
+    "hit_distance": Layer(
+        ("hit_distance.Z",),
+        "harmonic mean distance from the first hits to what the rays going on from there met [scene units]; rays that"
+        " met nothing count as infinite; 0 where all did",
+    ),
     "variance": Layer(
         ("variance.R", "variance.G", "variance.B"),
         "estimated variance of the pixel's mean in `image`, per channel [squared radiance]",

@@ -7,9 +7,12 @@ import warp as wp
 
 from warpgi.film import Film
 from warpgi.job import Job
+from warpgi.methods.a_trous import ATrous
 from warpgi.methods.ambient_occlusion import AmbientOcclusion
+from warpgi.methods.irradiance_filter import IrradianceFilter
 from warpgi.methods.light_field import LightField
 from warpgi.methods.path import PathTracing, Sampler
+from warpgi.methods.random_parameter_filter import RandomParameterFilter
 
 
 class Method(Protocol):
@@ -51,6 +54,25 @@ METHODS: dict[str, type] = {
     "path": PathTracing,
     "light-field": LightField,
     "ambient-occlusion": AmbientOcclusion,
+    "a-trous": ATrous,
+    "random-parameter-filter": RandomParameterFilter,
+    "irradiance-filter": IrradianceFilter,
 }
 
-__all__ = ["METHODS", "AmbientOcclusion", "LightField", "Method", "PathTracing", "Sampler"]
+#: Those that make a picture of a sample buffer alone, and those that filter the layers of a finished one.
+RECONSTRUCTIONS = {name: kind for name, kind in METHODS.items() if hasattr(kind, "layers")}
+DENOISERS = {name: kind for name, kind in METHODS.items() if hasattr(kind, "on_layers")}
+
+__all__ = [
+    "DENOISERS",
+    "METHODS",
+    "RECONSTRUCTIONS",
+    "ATrous",
+    "AmbientOcclusion",
+    "IrradianceFilter",
+    "LightField",
+    "Method",
+    "PathTracing",
+    "RandomParameterFilter",
+    "Sampler",
+]
