@@ -39,9 +39,9 @@ class IrradianceFilter(SampleFilter):
     """Radius in times the harmonic mean distance, above 0; larger is smoother and blurs more."""
     min_radius: float = 8.0
     """Smallest radius, in distances of neighbouring pixels; the filter is as wide as that in corners."""
-    max_radius: float = 20.0
+    max_radius: float = 16.0
     """Largest radius, likewise; time grows with its square."""
-    angle: float = 40.0
+    angle: float = 50.0
     """Difference of normals at which weights reach 0, in (0, 180] degrees."""
     demodulate: bool = True
     """Divide layers by albedo first, so that textures stay sharp; samples come without it."""
