@@ -123,6 +123,17 @@ def test_an_image_alone_and_an_image_beside():
     np.testing.assert_allclose(both_layers.image, filtered.layers["indirect"] + 2.0, atol=1e-6)
 
 
+@pytest.mark.parametrize("sky", [0.0, 1e10, np.inf])
+def test_depth_knows_the_sky(sky):
+    """Without normals, depth says where nothing was met, as programs write it: such pixels stay and darken nobody."""
+    picture = layers((0.5, 1.0, 2.0))
+    del picture["normal"], picture["position"]
+    picture["depth"][:5], picture["indirect"][:5] = sky, 7.0
+    result = gi.denoise(picture, gi.ATrous(sigma_normal=None, sigma_position=None))
+    assert result.counts["nonfinite_input"] == 0
+    np.testing.assert_allclose(result.layers["indirect"], picture["indirect"], rtol=4 * 2.0**-23)
+
+
 def test_depth_stands_in_for_position():
     """A step in depth alone keeps the light of both sides apart; without depth or position it takes a setting."""
     picture = layers(1.0)

@@ -61,7 +61,7 @@ def test_support_follows_the_harmonic_mean_distance():
     """Twice as far hits, twice the radius, until the bounds in pixels."""
     samples = plane(30, 30, 4)
     near = replace(samples, hit=samples.origin + 0.25 * (samples.hit - samples.origin))
-    method = gi.IrradianceFilter(support=0.5, min_radius=0.5, max_radius=100.0)
+    method = gi.IrradianceFilter(support=0.5, min_radius=0.3, max_radius=100.0)
     radii = [method.reconstruction(s, gi.Device("cpu"), 0).radius for s in (samples, near)]
     np.testing.assert_allclose(radii[0], 4.0 * radii[1], rtol=1e-5)
     # the smallest radius, over which distances are smoothed, is less than a pixel here

@@ -544,7 +544,7 @@ def test_what_cannot_be_reconstructed_is_refused(box, tmp_path):
     for samples, method, settings, kind, message in (
         (np.zeros((4, 3)), None, {}, TypeError, "samples is ndarray, expected SampleBuffer"),
         (gi.scenes.cornell_box(), None, {}, TypeError, "samples is Scene, expected SampleBuffer"),
-        (plain, gi.PathTracing(), {}, TypeError, "method is PathTracing, expected LightField or AmbientOcclusion"),
+        (plain, gi.PathTracing(), {}, TypeError, "method is PathTracing, expected LightField, AmbientOcclusion, "),
         (plain, None, {"seed": -1}, ValueError, "seed is -1, expected"),
         (plain, light_field(recursive=1), {}, ValueError, "lack throughput or hit_direct"),
         (SampleBuffer.load(old), None, {}, ValueError, "no secondary rays"),
