@@ -68,6 +68,7 @@ def scaling_command(
 def figures_command(
     out: Path,
     scene: str = "cornell-box",
+    methods: tuple[str, ...] = ("light-field",),
     size: tuple[int, int] = (256, 256),
     spp: int = 8,
     rays: int = 256,
@@ -75,11 +76,12 @@ def figures_command(
     exposure: float = 0.0,
     device: str | None = None,
 ) -> None:
-    """Picture of the indirect light of a scene: input, reconstruction and reference side by side.
+    """Picture of the indirect light of a scene: input, methods and reference side by side.
 
     Args:
         out: PNG to write.
         scene: Built-in scene.
+        methods: Methods that work on samples: light-field, a-trous, ...
         size: Width and height of each panel in pixels.
         spp: Input samples per pixel.
         rays: Reconstruction rays per pixel.
@@ -87,7 +89,7 @@ def figures_command(
         exposure: Stops by which the picture is brightened.
         device: cpu, cuda, cuda:0, ...; a GPU if there is one.
     """
-    figures.light_field(out, scene, size, spp, rays, reference_spp, exposure, device)
+    figures.side_by_side(out, scene, methods, size, spp, rays, reference_spp, exposure, device)
 
 
 def main(arguments: list[str] | None = None) -> int:

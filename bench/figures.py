@@ -9,14 +9,16 @@ import numpy as np
 import warpgi as gi
 from warpgi import checks
 from warpgi.image import check_output, write_png
+from warpgi.methods import RECONSTRUCTIONS
 
 GAP = 4  # pixels between panels
 WHITE = 1e4  # radiance of the gap
 
 
-def light_field(
+def side_by_side(
     out: Path,
     scene: str,
+    methods: tuple[str, ...],
     size: tuple[int, int],
     spp: int,
     rays: int,
@@ -24,22 +26,25 @@ def light_field(
     exposure: float,
     device: str | None,
 ) -> None:
-    """Indirect light of one scene, left to right: the input, its reconstruction, the path-traced reference."""
+    """Indirect light of one scene, left to right: the input, each method, the path-traced reference."""
     check_output(out)
     checks.count("reference_spp", reference_spp)
     built = gi.scenes.build(scene)
-    methods = {
-        f"input, {spp} spp": gi.PathTracing(spp=spp),
-        f"reconstruction, {spp} spp and {rays} rays": gi.LightField(spp=spp, rays=rays),
-        f"reference, {reference_spp} spp": gi.PathTracing(spp=reference_spp),
-    }
-    panels = [
+    panels = {f"input, {spp} spp": (0, gi.PathTracing(spp=spp))}
+    for name in methods:
+        if name not in RECONSTRUCTIONS:
+            raise ValueError(f"methods holds {name!r}, expected names out of {', '.join(RECONSTRUCTIONS)}")
+        kind = RECONSTRUCTIONS[name]
+        panels[f"{name}, {spp} spp"] = (1, kind(spp=spp, rays=rays) if hasattr(kind, "rays") else kind(spp=spp))
+    panels[f"reference, {reference_spp} spp"] = (2, gi.PathTracing(spp=reference_spp))
+    pictures = [
         gi.render(built, method, size, seed, device, progress=True).layers["indirect"]
-        for seed, method in enumerate(methods.values())
+        for seed, method in panels.values()
     ]
-    for name, panel in zip(methods, panels[:2], strict=False):
-        errors = gi.compare(panel, panels[2])
+    for name, picture in zip(panels, pictures[:-1], strict=False):
+        errors = gi.compare(picture, pictures[-1])
         print(f"{name}: {', '.join(f'{kind} {value:.4g}' for kind, value in errors.items() if value is not None)}")
     gap = np.full((size[1], GAP, 3), WHITE, np.float32)
-    write_png(out, np.concatenate([panels[0], gap, panels[1], gap, panels[2]], axis=1), exposure)
+    row = [part for picture in pictures for part in (picture, gap)][:-1]
+    write_png(out, np.concatenate(row, axis=1), exposure)
     print(f"wrote {out}")

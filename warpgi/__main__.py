@@ -27,7 +27,7 @@ INTERRUPTED = 130
 # Counts of what a user should hear of.
 WRONG = {
     "nonfinite": "samples were not finite and were dropped",
-    "nonfinite_input": "pixels or samples were not finite and were left out",
+    "nonfinite_pixels": "pixels were not finite and were left out",
     "zero_length": "samples had no length and were dropped",
     "bad_normal": "samples had no normal and were dropped",
     "degenerate_triangles": "triangles without area were dropped",

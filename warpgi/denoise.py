@@ -36,7 +36,7 @@ def denoise(
 
     Returns:
         The picture's layers, the filtered one in place of its input and without "variance", which it no longer has.
-        `counts["nonfinite_input"]` says how many pixels were not finite.
+        `counts["nonfinite_pixels"]` says how many pixels were not finite.
 
     Raises:
         TypeError, ValueError: an argument is wrong or a layer is missing; nothing has been computed then.

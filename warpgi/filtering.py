@@ -6,7 +6,7 @@ Filters work on light without the texture that it falls on: radiance divided by 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -53,8 +53,8 @@ class FilterInput:
     """Harmonic mean distance of secondary hits, shape (N,), 0: none met anything; None: not known."""
     samples: SampleBuffer | None = None
     """What it was made of, where the rows are its samples or their pixels."""
-    nonfinite: int = 0
-    """Rows left out because a number in them is NaN or infinite."""
+    counts: dict[str, int] = field(default_factory=dict)
+    """What is wrong with the input, by kind."""
 
     @property
     def first(self) -> np.ndarray:
@@ -122,7 +122,7 @@ def sample_rows(samples: SampleBuffer) -> FilterInput:
         position=np.where(primary[:, None], samples.origin, zero),
         hit_normal=np.where(samples.checked.is_splat[:, None], samples.unit_hit_normal, -samples.direction),
         samples=samples,
-        nonfinite=samples.checked.counts["nonfinite"],
+        counts=_faults(samples),
     )
 
 
@@ -153,7 +153,7 @@ def pixel_rows(samples: SampleBuffer) -> FilterInput:
         position=_divide(mean(primary, samples.origin), seen, seen > 0),
         hit_distance=hit_distance(samples).reshape(-1),
         samples=samples,
-        nonfinite=samples.checked.counts["nonfinite"],
+        counts=_faults(samples),
     )
 
 
@@ -203,7 +203,7 @@ def layer_rows(
         normal=np.where(takes, flat["normal"] if normal else up, zero),
         position=np.where(takes, places, zero),
         hit_distance=flat["hit_distance"][:, 0] if "hit_distance" in layers else None,
-        nonfinite=int((~finite.all(axis=1) | (met & ~good)).sum()),
+        counts={"nonfinite_pixels": int((~finite.all(axis=1) | (met & ~good)).sum())},
     )
 
 
@@ -219,8 +219,6 @@ def hit_distance(samples: SampleBuffer) -> np.ndarray:
 
 class Filtering(Protocol):
     """A filter at work."""
-
-    counts: dict[str, int]
 
     def gather(self, first: int, count: int, total: int) -> None:
         """Does units `first` to `first + count - 1` of `total`."""
@@ -321,6 +319,10 @@ def _usable(samples: SampleBuffer) -> tuple[np.ndarray, np.ndarray]:
     return state.is_primary, state.is_primary & (state.is_splat | state.is_escaped)
 
 
+def _faults(samples: SampleBuffer) -> dict[str, int]:
+    return {name: count for name, count in samples.checked.counts.items() if name != "primary_missed"}
+
+
 def _check_secondary(samples: SampleBuffer) -> None:
     if not samples.has_secondary_rays:
         raise ValueError("samples hold no secondary rays, expected a sample buffer of format 2.0 or newer")
@@ -336,7 +338,8 @@ def _positions(layers: Mapping[str, np.ndarray]) -> np.ndarray:
     height, width = depth.shape
     scale = 2.0 * ASSUMED_TAN / max(width, height)
     y, x = np.mgrid[:height, :width]
-    place = np.stack([(x - 0.5 * width) * scale * depth, (y - 0.5 * height) * scale * depth, depth], axis=-1)
+    with np.errstate(invalid="ignore", over="ignore"):  # a sky at infinity is no position
+        place = np.stack([(x - 0.5 * width) * scale * depth, (y - 0.5 * height) * scale * depth, depth], axis=-1)
     return place.astype(np.float32).reshape(-1, 3)
 
 

@@ -112,7 +112,6 @@ class ATrousFiltering:
         self._next = [device.zeros(len(rows.pixel), wp.vec3) for _ in range(2)]
         count = rows.known.sum(dtype=np.float64)
         self._mean = float(rows.value.sum(dtype=np.float64) / count) if count else 0.0
-        self.counts = {"nonfinite_input": rows.nonfinite}
 
     def gather(self, first: int, count: int, total: int) -> None:
         """Does passes `first` to `first + count - 1`."""
@@ -127,7 +126,7 @@ class ATrousFiltering:
 
     def all_counts(self) -> dict[str, int]:
         """What was left out."""
-        return self.counts
+        return self.rows.counts
 
     def _falloff(self, i: int) -> kernels.Falloff:
         settings = self.settings

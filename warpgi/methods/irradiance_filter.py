@@ -109,7 +109,6 @@ class IrradianceFiltering:
         self.value, self.known = device.array(rows.value, wp.vec3), device.array(rows.known, wp.vec3)
         # what is not done yet stays as it came
         self.filtered, self.filled = device.array(rows.value, wp.vec3), device.array(rows.known, wp.vec3)
-        self.counts = {"nonfinite_input": rows.nonfinite}
 
     def _smooth(self, distance: np.ndarray, radius: np.ndarray) -> np.ndarray:
         """Harmonic mean distance of more than a pixel's few rays; infinite where none met anything."""
@@ -133,7 +132,7 @@ class IrradianceFiltering:
 
     def all_counts(self) -> dict[str, int]:
         """What was left out."""
-        return self.counts
+        return self.rows.counts
 
 
 class SurfaceFilter:

@@ -133,7 +133,6 @@ class RandomParameterFiltering:
         self.value, self.known = device.array(rows.value, wp.vec3), struct.known
         self.next = device.array(rows.value, wp.vec3)
         self.filled = device.zeros(len(samples), int)
-        self.counts = {"nonfinite_input": rows.nonfinite}
 
     def _neighbourhoods(self, size: int) -> kernels.Neighbourhoods:
         found, device, chunk = kernels.Neighbourhoods(), self.device, self.chunk
@@ -181,7 +180,7 @@ class RandomParameterFiltering:
 
     def all_counts(self) -> dict[str, int]:
         """What was left out."""
-        return self.counts
+        return self.rows.counts
 
 
 def _hits(samples: SampleBuffer, usable: np.ndarray) -> np.ndarray:
