@@ -24,36 +24,22 @@ class SplatTree:
     block_count: int
 
 
-# Squared distance to the k-th neighbour in the metric |d|^2 + stretch (d.n)^2, the sample itself counted, and in
-# Euclid's; samples at the very same place are not neighbours, or they would vanish.
-NEAREST = (
-    LANES_HEAD
-    + """
-    const int block0 = i / 8;
-    const float* q = tree.blocks.data + (size_t)block0 * 80 + i % 8;
-    const float cx = q[0], cy = q[8], cz = q[16], nx = q[24], ny = q[32], nz = q[40];
-    const int want = k - 1;
-    float metric[32], plain[32];
-    int found = 0;
-    float worst = 1.0e30f;
+# The search for what is nearest to (cx, cy, cz) in the metric |d|^2 + stretch (d.n)^2: every lane that ACCEPT takes and
+# that is nearer than `worst` is handed to KEEP, which lowers `worst`. `block0` is where to begin, -1: at the root.
+SEARCH_HEAD = """
     int stack[128];
     float entry[128];
-    int top = 0;
-    int current = -1 - block0;
-    // the three blocks around the sample first: they bound the search
-    int begin = block0 > 0 ? block0 - 1 : 0, end = block0 + 1 < tree.block_count ? block0 + 1 : block0;
+    stack[0] = 0;
+    entry[0] = 0.0f;
+    int top = 1;
+    // the three blocks around `block0` first: they bound the search
+    const int begin = block0 > 0 ? block0 - 1 : 0;
+    const int end = block0 < 0 ? -1 : (block0 + 1 < tree.block_count ? block0 + 1 : block0);
     int next = begin;
-    bool start = true;
     while (true) {
-        int block = -1;
-        if (start) {
+        int block = -1, current = 0;
+        if (next <= end) {
             block = next++;
-            if (next > end) {
-                start = false;
-                stack[0] = 0;
-                entry[0] = 0.0f;
-                top = 1;
-            }
         } else {
             if (top == 0)
                 break;
@@ -76,22 +62,14 @@ NEAREST = (
                 const float along = dx * nx + dy * ny + dz * nz;
                 d2[j] = dx * dx + dy * dy + dz * dz;
                 m2[j] = d2[j] + stretch * along * along;
-                met[j] = (int)((p[48 + j] >= 0.0f) & (d2[j] > 0.0f) & (m2[j] < worst));
+                met[j] = (int)((p[48 + j] >= 0.0f) & (d2[j] > 0.0f) & (m2[j] < worst)ACCEPT);
             }
             unsigned mask = lane_mask(met);
             while (mask) {
                 const int j = next_lane(mask);
                 if (m2[j] < worst) {
-                    int slot = found < want ? found++ : want - 1;
-                    while (slot > 0 && metric[slot - 1] > m2[j]) {
-                        metric[slot] = metric[slot - 1];
-                        plain[slot] = plain[slot - 1];
-                        --slot;
-                    }
-                    metric[slot] = m2[j];
-                    plain[slot] = d2[j];
-                    if (found == want)
-                        worst = metric[want - 1];
+"""
+SEARCH_TAIL = """
                 }
             }
         } else {
@@ -121,8 +99,40 @@ NEAREST = (
             }
         }
     }
-    return found > 0 ? plain[found - 1] : -1.0f;
 """
+
+
+def search(keep: str, accept: str = "") -> str:
+    """Native code of the search, with what to do with a lane, and a further test of lanes."""
+    return SEARCH_HEAD.replace("ACCEPT", accept) + keep + SEARCH_TAIL
+
+
+# Squared distance to the k-th neighbour in that metric, the sample itself counted, and in Euclid's; samples at the
+# very same place are not neighbours, or they would vanish.
+NEAREST = (
+    LANES_HEAD
+    + """
+    const int block0 = i / 8;
+    const float* q = tree.blocks.data + (size_t)block0 * 80 + i % 8;
+    const float cx = q[0], cy = q[8], cz = q[16], nx = q[24], ny = q[32], nz = q[40];
+    const int want = k - 1;
+    float metric[32], plain[32];
+    int found = 0;
+    float worst = 1.0e30f;
+"""
+    + search("""
+                    int slot = found < want ? found++ : want - 1;
+                    while (slot > 0 && metric[slot - 1] > m2[j]) {
+                        metric[slot] = metric[slot - 1];
+                        plain[slot] = plain[slot - 1];
+                        --slot;
+                    }
+                    metric[slot] = m2[j];
+                    plain[slot] = d2[j];
+                    if (found == want)
+                        worst = metric[want - 1];
+""")
+    + "    return found > 0 ? plain[found - 1] : -1.0f;\n"
 )
 
 

@@ -8,7 +8,7 @@ from warpgi.device import Device
 from warpgi.lights import DistantLight, Environment, PointLight, SpotLight
 from warpgi.load import load_scene
 from warpgi.materials import Conductor, Dielectric, Diffuse, Emissive, Mirror, Texture
-from warpgi.methods import METHODS, AmbientOcclusion, LightField, PathTracing, Sampler
+from warpgi.methods import METHODS, AmbientOcclusion, Kernel, LightField, PathTracing, PhotonMap, Sampler
 from warpgi.metrics import compare
 from warpgi.progress import Progress
 from warpgi.reconstruct import reconstruct
@@ -30,9 +30,11 @@ __all__ = [
     "Emissive",
     "Environment",
     "Interrupted",
+    "Kernel",
     "LightField",
     "Mirror",
     "PathTracing",
+    "PhotonMap",
     "PointLight",
     "Progress",
     "Render",

@@ -32,6 +32,7 @@ class DeviceScene:
     Attributes:
         struct: the `kernels.scene.Scene` argument of kernels.
         centre: float64 world position of the device's origin, shape (3,).
+        power: radiant flux of all lights but the environment, mean over the channels [W], as light sampling knows it.
         nbytes: bytes of all arrays on the device.
     """
 
@@ -139,7 +140,8 @@ class DeviceScene:
         powers = [part * factor for part, factor in zip(powers, raise_by, strict=True)]
         density = {i: value * factor for (i, value), factor in zip(density.items(), raise_by, strict=False)}
         power = np.concatenate(powers) if powers else np.zeros(0)
-        total = float(power.sum()) or 1.0
+        self.power = float(power.sum())
+        total = self.power or 1.0
         struct = self.struct
         struct.environment = wp.vec3(*environment)
         struct.light_count = len(power)
