@@ -10,7 +10,7 @@ from warpgi.kernels.splats import SplatTree, search, vec8
 
 wp.set_module_options({"enable_backward": False})
 
-MAX_PHOTONS = 256  # the length of the arrays in NEAREST_PHOTONS
+MAX_PHOTONS = 256  # half the length of the arrays in NEAREST_PHOTONS
 
 # Shapes of the kernel K(v) / (pi h^2), v = d^2 / h^2 in [0, 1), each of integral 1 over the disc.
 CONSTANT = wp.constant(0)
@@ -61,63 +61,98 @@ AT_POINT = """
 # Sum of kernel times flux over the k nearest photons, of which the last sets the radius and is not counted, so that the
 # mean is right where photons lie evenly; times pi h^2. Photons at the very same place are the asking one itself.
 # No farther than the root of `limit2`, which is the radius where fewer are found. The radius is then scaled.
-# Returns the sum, h^2 and the photons in it.
+# `guess2` bounds the search at first; 0: a bound from how large the boxes of the nearest photons are. Where it was too
+# small the search begins anew. What is found does not depend on it, but the order of the sum does.
+# Returns the sum, h^2, the photons in it, and the squared distance of the k-th.
 NEAREST_PHOTONS = (
     LANES_HEAD
     + KERNEL
     + AT_POINT
     + """
-    float distance[256];
-    int place[256];
+    float distance[512];
+    int place[512];
+    const int room = 2 * k;
     int found = 0;
-    float worst = limit2;
-    auto sift = [&](int hole, int size, float d, int at) {
-        while (true) {
-            int child = 2 * hole + 1;
-            if (child >= size)
-                break;
-            if (child + 1 < size && distance[child + 1] > distance[child])
-                ++child;
-            if (distance[child] <= d)
-                break;
-            distance[hole] = distance[child];
-            place[hole] = place[child];
-            hole = child;
-        }
-        distance[hole] = d;
-        place[hole] = at;
+    float guess = guess2;
+    float worst = guess > 0.0f ? smaller(guess, limit2) : limit2;
+    auto swap = [&](int i, int j) {
+        const float d = distance[i];
+        const int at = place[i];
+        distance[i] = distance[j];
+        place[i] = place[j];
+        distance[j] = d;
+        place[j] = at;
     };
+    // the k nearest to the front, the farthest of them last (Hoare 1961)
+    auto select = [&]() {
+        int low = 0, high = found - 1;
+        while (low < high) {
+            const float pivot = distance[k - 1];
+            int i = low, j = high;
+            do {
+                while (distance[i] < pivot)
+                    ++i;
+                while (pivot < distance[j])
+                    --j;
+                if (i <= j)
+                    swap(i++, j--);
+            } while (i <= j);
+            if (j < k - 1)
+                low = i;
+            if (k - 1 < i)
+                high = j;
+        }
+        found = k;
+        worst = distance[k - 1];
+    };
+    while (true) {
 """
     + search(
         """
-                    if (found < k) {
-                        distance[found] = m2[j];
-                        place[found] = block * 8 + j;
-                        if (++found == k) {
-                            // a heap from here on, the farthest on top
-                            for (int slot = k / 2 - 1; slot >= 0; --slot)
-                                sift(slot, k, distance[slot], place[slot]);
-                            worst = distance[0];
-                        }
-                    } else {
-                        sift(0, k, m2[j], block * 8 + j);
-                        worst = distance[0];
+                    distance[found] = m2[j];
+                    place[found] = block * 8 + j;
+                    ++found;
+                    if (found == k) {
+                        float farthest = 0.0f;
+                        for (int i = 0; i < k; ++i)
+                            farthest = larger(farthest, distance[i]);
+                        worst = smaller(worst, farthest);
+                    } else if (found == room) {
+                        select();
                     }
 """,
         FACING,
+        """
+            if (guess == 0.0f && first < 0) {
+                // 64 photons lie in these boxes, which are somewhat smaller than the photons' share of the surface
+                float area = 0.0f;
+                for (int j = 0; j < 8; ++j) {
+                    const float ex = p[24 + j] - p[j], ey = p[32 + j] - p[8 + j], ez = p[40 + j] - p[16 + j];
+                    area += larger(larger(ex * ey, ey * ez), larger(ex * ez, 0.0f));
+                }
+                guess = (2.5f / (64.0f * 3.14159265f)) * area * (float)k;
+                worst = smaller(worst, guess);
+            }
+""",
     )
     + """
-    float h2 = worst;
-    if (found < k && limit2 >= 1.0e30f) {
-        // all photons there are
-        h2 = 0.0f;
-        for (int j = 0; j < found; ++j)
-            h2 = larger(h2, distance[j]);
+        if (found >= k || guess <= 0.0f || guess >= limit2)
+            break;
+        guess = 1.0e38f;
+        worst = limit2;
+        found = 0;
     }
-    h2 *= scale2;
+    if (found > k)
+        select();
+    float kth = limit2;
+    if (found == k || limit2 >= 1.0e30f) {
+        kth = 0.0f;
+        for (int j = 0; j < found; ++j)
+            kth = larger(kth, distance[j]);
+    }
+    const float h2 = kth * scale2, inverse = 1.0f / h2;
     float sum[3] = {0.0f, 0.0f, 0.0f};
     int inside = 0;
-    const float inverse = 1.0f / h2;
     for (int j = 0; j < found; ++j) {
         if (distance[j] < h2) {
             flux_of(place[j], weight_of(distance[j] * inverse), sum);
@@ -126,6 +161,7 @@ NEAREST_PHOTONS = (
     }
     wp::vec_t<8, wp::float32> result;
     result[0] = sum[0]; result[1] = sum[1]; result[2] = sum[2]; result[3] = h2; result[4] = (float)inside;
+    result[5] = kth;
     return result;
 """
 )
@@ -137,6 +173,7 @@ def nearest_photons(
     x: wp.vec3,
     n: wp.vec3,
     k: int,
+    guess2: float,
     limit2: float,
     scale2: float,
     stretch: float,
@@ -196,6 +233,10 @@ NEAREST_PLACE = (
 def nearest_place(tree: SplatTree, x: wp.vec3, n: wp.vec3, stretch: float, facing: float) -> int: ...
 
 
+# The k-th photon of a search nearby is rarely farther, by the squares.
+GUESS_NEARBY = wp.constant(1.5)
+
+
 @wp.struct
 class Lookup:
     """How the light at a point is made from photons."""
@@ -214,6 +255,7 @@ class Lookup:
 class Density:
     irradiance: wp.vec3  # [W/m^2]
     radius2: float
+    guess2: float  # for a search nearby
     rays: int
 
 
@@ -243,16 +285,17 @@ def share_on_surface(scene: Scene, look: Lookup, x: wp.vec3, n: wp.vec3, radius:
 
 
 @wp.func
-def density(tree: SplatTree, scene: Scene, look: Lookup, x: wp.vec3, n: wp.vec3, key: int, index: int):
-    """Irradiance at x on the side of n; `key` and `index` choose the probes."""
+def density(tree: SplatTree, scene: Scene, look: Lookup, x: wp.vec3, n: wp.vec3, guess2: float, key: int, index: int):
+    """Irradiance at x on the side of n; `key` and `index` choose the probes, `guess2` helps the search, 0: nothing."""
     result = Density()
     if tree.count == 0:
         return result
     found = vec8()
     if look.neighbours > 0:
         found = nearest_photons(
-            tree, x, n, look.neighbours, look.limit2, look.scale2, look.stretch, look.facing, look.shape
+            tree, x, n, look.neighbours, guess2, look.limit2, look.scale2, look.stretch, look.facing, look.shape
         )
+        result.guess2 = GUESS_NEARBY * found[5]
     else:
         found = near_photons(tree, x, n, look.limit2 * look.scale2, look.stretch, look.facing, look.shape)
     result.radius2 = found[3]

@@ -62,16 +62,20 @@ class View:
 
 @wp.kernel
 def estimate_at(offset: int, scene: Scene, photons: SplatTree, look: Lookup, seed: int, points: SplatTree):
-    """One thread writes one lane of `points`: the irradiance there by `photons`, and its radius squared."""
-    i = offset + wp.tid()
-    k = (i // LANES) * BLOCK_STRIDE + i % LANES
+    """One thread writes one block of `points`: the irradiance at its points by `photons`, and its radius squared."""
+    block = offset + wp.tid()
     b = points.blocks
-    x = wp.vec3(b[k], b[k + 8], b[k + 16])
-    n = wp.vec3(b[k + 24], b[k + 32], b[k + 40])
-    found = density(photons, scene, look, x, n, i, seed)
-    points.blocks[k + RADIUS_ROW] = found.radius2
-    for axis in range(3):
-        points.blocks[k + (7 + axis) * LANES] = found.irradiance[axis]
+    guess2 = float(0.0)
+    for lane in range(LANES):
+        k = block * BLOCK_STRIDE + lane
+        if b[k + RADIUS_ROW] >= 0.0:
+            x = wp.vec3(b[k], b[k + 8], b[k + 16])
+            n = wp.vec3(b[k + 24], b[k + 32], b[k + 40])
+            found = density(photons, scene, look, x, n, guess2, block * LANES + lane, seed)
+            guess2 = found.guess2
+            points.blocks[k + RADIUS_ROW] = found.radius2
+            for axis in range(3):
+                points.blocks[k + (7 + axis) * LANES] = found.irradiance[axis]
 
 
 @wp.func
@@ -152,7 +156,7 @@ def incident_light(scene: Scene, maps: Maps, sampler: Sampler, key: int, index: 
                 light = sampled_light(scene, shape, s, n, wo, sampler, pair)
                 result.shadow_rays = result.shadow_rays + light.shadow_rays
                 result.radiance = result.radiance + wp.cw_mul(throughput, light.radiance)
-            caustic = density(maps.caustic, scene, maps.caustic_look, s.p, n, key, index)
+            caustic = density(maps.caustic, scene, maps.caustic_look, s.p, n, 0.0, key, index)
             result.closest_hit_rays = result.closest_hit_rays + caustic.rays
             reflected = wp.cw_mul(throughput, wp.cw_mul(s.albedo, caustic.irradiance)) * INV_PI
             result.radiance = result.radiance + reflected
@@ -168,7 +172,8 @@ def incident_light(scene: Scene, maps: Maps, sampler: Sampler, key: int, index: 
 @wp.func
 def gather_direction(seed: int, sampler: int, key: int, index: int, n: wp.vec3):
     return to_world(
-        make_frame(n), square_to_cosine_hemisphere(sample_2d(make_sampler(seed, key, index, sampler), FIRST_GATHER_PAIR))
+        make_frame(n),
+        square_to_cosine_hemisphere(sample_2d(make_sampler(seed, key, index, sampler), FIRST_GATHER_PAIR)),
     )
 
 
@@ -247,11 +252,11 @@ def follow(scene: Scene, maps: Maps, view: View, pixel: int, index: int, sampler
                         sky = wp.cw_mul(s.albedo, scene.environment) * share
                         path = add_light(path, depth + 1, wp.cw_mul(throughput, sky))
             # caustics, and the rest of the map or what gather rays bring of it
-            found = density(maps.caustic, scene, maps.caustic_look, s.p, n, pixel, index)
+            found = density(maps.caustic, scene, maps.caustic_look, s.p, n, 0.0, pixel, index)
             path.closest_hit_rays = path.closest_hit_rays + found.rays
             irradiance = found.irradiance
             if view.gather == 0:
-                found = density(maps.diffuse, scene, maps.diffuse_look, s.p, n, pixel, index)
+                found = density(maps.diffuse, scene, maps.diffuse_look, s.p, n, 0.0, pixel, index)
                 path.closest_hit_rays = path.closest_hit_rays + found.rays
                 irradiance = irradiance + found.irradiance
             else:

@@ -7,8 +7,14 @@ from warpgi.kernels.direct import facing_normal, reflects
 from warpgi.kernels.film import is_finite
 from warpgi.kernels.lights import light_probability, pick_light
 from warpgi.kernels.rng import Sampler, make_sampler, sample_2d
-from warpgi.kernels.sampling import PI, make_frame, square_to_cosine_hemisphere, square_to_disc, square_to_triangle
-from warpgi.kernels.sampling import to_world
+from warpgi.kernels.sampling import (
+    PI,
+    make_frame,
+    square_to_cosine_hemisphere,
+    square_to_disc,
+    square_to_triangle,
+    to_world,
+)
 from warpgi.kernels.scene import DIELECTRIC, DIFFUSE, Scene, closest_hit, offset_origin, ray_offset, surface_at
 
 wp.set_module_options({"enable_backward": False})
@@ -271,9 +277,7 @@ class Tracks:
 
 
 @wp.kernel
-def shoot(
-    offset: int, scene: Scene, emission: Emission, first_path: int, slots: int, photons: Photons, tracks: Tracks
-):
+def shoot(offset: int, scene: Scene, emission: Emission, first_path: int, slots: int, photons: Photons, tracks: Tracks):
     """One thread owns one path of a batch: its first `slots` photons, and how many there are."""
     i = offset + wp.tid()
     track = trace_photons(scene, emission, first_path + i, photons, i * slots, slots)

@@ -25,7 +25,8 @@ class SplatTree:
 
 
 # The search for what is nearest to (cx, cy, cz) in the metric |d|^2 + stretch (d.n)^2: every lane that ACCEPT takes and
-# that is nearer than `worst` is handed to KEEP, which lowers `worst`. `block0` is where to begin, -1: at the root.
+# that is nearer than `worst` is handed to KEEP, which lowers `worst`. `block0` is where to begin, -1: at the root. NODE
+# sees each node (`p`, and its `first` child) before its children.
 SEARCH_HEAD = """
     int stack[128];
     float entry[128];
@@ -74,6 +75,8 @@ SEARCH_TAIL = """
             }
         } else {
             const float* p = tree.nodes.data + (size_t)current * 48;
+            const int first = tree.first.data[current];
+            NODE
             float d2[8];
             int met[8];
             for (int j = 0; j < 8; ++j) {
@@ -83,7 +86,6 @@ SEARCH_TAIL = """
                 d2[j] = dx * dx + dy * dy + dz * dz;
                 met[j] = (int)(d2[j] < worst);
             }
-            const int first = tree.first.data[current];
             const int base = top;
             unsigned mask = lane_mask(met);
             while (mask) {
@@ -102,9 +104,9 @@ SEARCH_TAIL = """
 """
 
 
-def search(keep: str, accept: str = "") -> str:
-    """Native code of the search, with what to do with a lane, and a further test of lanes."""
-    return SEARCH_HEAD.replace("ACCEPT", accept) + keep + SEARCH_TAIL
+def search(keep: str, accept: str = "", node: str = "") -> str:
+    """Native code of the search: what to do with a lane, a further test of lanes, and what to do at a node."""
+    return SEARCH_HEAD.replace("ACCEPT", accept) + keep + SEARCH_TAIL.replace("NODE", node)
 
 
 # Squared distance to the k-th neighbour in that metric, the sample itself counted, and in Euclid's; samples at the

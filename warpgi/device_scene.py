@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+
 import numpy as np
 import warp as wp
 
@@ -63,6 +65,14 @@ class DeviceScene:
         result.focus_distance = camera.focus_distance or distance
         result.width, result.height = size
         return result
+
+    def fingerprint(self) -> str:
+        """SHA-256 of everything that a picture depends on."""
+        digest = hashlib.sha256(repr((self.scene.camera, self.centre.tolist())).encode())
+        digest.update(repr(self.struct.environment).encode())
+        for array in self._arrays:
+            digest.update(array.numpy().tobytes())
+        return digest.hexdigest()
 
     def _upload(self, values: np.ndarray, dtype: object) -> wp.array:
         array = self.device.array(values, dtype)

@@ -24,6 +24,8 @@ from warpgi.splat_tree import SplatTree
 PHOTONS_PER_PATH = 4
 # Probes of the surface start so many radii above it.
 PROBE_LIFT = 0.1
+# Added to a map's number: paths that only say where irradiance is to be known.
+OTHER_PATHS = 1 << 30
 # Beyond any scene.
 UNLIMITED = 1e30
 
@@ -95,11 +97,12 @@ class PhotonMap:
     final_gather: int = 0
     """Rays per camera path that gather indirect light from the map at their hits; 0: the map is seen directly."""
     gather_stride: int = 4
-    """With final gathering irradiance is computed at every so many photons, and gather rays take the nearest."""
+    """With final gathering irradiance is computed at a point for every so many photons, and gather rays take the
+    nearest."""
     near: float = 1.0
     """Gather hits nearer than so many radii of their estimate are traced on, 0 or above: the map is bad in corners."""
-    light_samples: int = 32
-    """Shadow rays to lights per pixel, shared out over its camera paths."""
+    light_samples: int = 2
+    """Shadow rays to lights from each camera path's diffuse surface."""
     sampler: Sampler = Sampler.SOBOL
     """Where random numbers come from."""
 
@@ -132,6 +135,11 @@ class PhotonMap:
             raise TypeError(f"sampler is {self.sampler!r}, expected a Sampler")
 
     @property
+    def keeps_all_in_film(self) -> bool:
+        """Whether the film is all that a later pass needs of earlier ones; maps can be made again."""
+        return True
+
+    @property
     def needs_light(self) -> bool:
         """Whether the picture of a scene without light is black."""
         return True
@@ -151,9 +159,10 @@ class PhotonMap:
         return BATCH_BYTES + photons * (PHOTON_BYTES + TREE_BYTES)
 
     def prepare(self, job: Job, film: Film) -> Mapping:
-        """The first map."""
+        """The first map, but where a picture goes on that is past it."""
         mapping = Mapping(self, job)
-        mapping.use(0)
+        if film.spp() < (self.map_spp or self.spp):
+            mapping.use(0)
         return mapping
 
     def estimate(self, job: Job, state: Mapping, film: Film, first: int, count: int) -> None:
@@ -190,7 +199,7 @@ class Mapping:
         self.source = PhotonSource(job.scene, job.seed, self.sampler)
         view = kernels.View()
         view.seed, view.sampler, view.gather = job.seed, self.sampler, settings.final_gather
-        view.light_samples = max(1, settings.light_samples // settings.spp)
+        view.light_samples = settings.light_samples
         self.view = view
         self.maps = kernels.Maps()
         self.number = -1
@@ -217,10 +226,12 @@ class Mapping:
         empty = np.zeros(0, np.int32)
         if s.final_gather:
             every = self._tree(shot, np.arange(shot.count, dtype=np.int32))
-            maps.irradiance = self._tree(shot, every_nth(shot.count, s.gather_stride))
+            # points of other paths: photons far from others stand for more of the surface, and are where light is
+            # underestimated, so that the map's own would darken it
+            points = source.shoot(-(-s.photons // s.gather_stride), number + OTHER_PATHS)
+            maps.irradiance = self._tree(points, np.arange(points.count, dtype=np.int32))
             inputs = [self.job.scene.struct, every, maps.diffuse_look, number]
-            count = maps.irradiance.count
-            self.job.device.launch(kernels.estimate_at, count, inputs, [maps.irradiance])
+            self.job.device.launch(kernels.estimate_at, maps.irradiance.block_count, inputs, [maps.irradiance])
             maps.diffuse = self._tree(shot, empty)
         else:
             maps.diffuse = self._tree(shot, shot.of_kind(int(photon_kernels.INDIRECT)))
@@ -256,8 +267,3 @@ class Mapping:
         self.counts["photon_rays"] += shot.rays
         self.counts["nonfinite_photons"] += shot.dropped
         self.counts[what] += shot.count
-
-
-def every_nth(count: int, stride: int) -> np.ndarray:
-    """Numbers 0, stride, 2 stride, ... below count."""
-    return np.arange(0, count, stride, dtype=np.int32)
