@@ -71,13 +71,13 @@ class PhotonSource:
         sky = float(np.mean(scene.struct.environment)) * 4.0 * np.pi**2 * scene.radius**2
         emission.environment = sky / max(sky + scene.power, 1e-30)
         self.dark = sky + scene.power <= 0.0
-        emission.aim_cdf = self.device.zeros(0, float)
         self.emission = emission
+        self._anywhere = self.device.zeros(0, float)
         self._aim: wp.array | None = None
 
     def shoot(self, paths: int, number: int) -> Shot:
         """All photons of `paths` paths of map `number`."""
-        return self._shoot(paths, number, False, self.emission.aim_cdf)
+        return self._shoot(paths, number, False, self._anywhere)
 
     def shoot_caustics(self, paths: int, number: int) -> Shot:
         """The caustic photons of `paths` paths, aimed where earlier ones found such."""
@@ -92,13 +92,12 @@ class PhotonSource:
 
     def _learn_aim(self) -> wp.array:
         """Running sum of the cells' probabilities: those from which a pilot's paths made caustics, and around them."""
-        none = self.device.zeros(0, float)
-        pilot = self._shoot(PILOT_PATHS, -1, True, none)
+        pilot = self._shoot(PILOT_PATHS, -1, True, self._anywhere)
         shape = (int(kernels.LIGHT_CELLS), int(kernels.AIM_CELLS), int(kernels.AIM_CELLS))
         size = int(np.prod(shape))
         found = (np.bincount(pilot.cells[pilot.stored > 0], minlength=size) > 0).reshape(shape)
         if not found.any():
-            return none
+            return self._anywhere
         wide = np.pad(found, ((0, 0), (1, 1), (1, 1)))
         rows, columns = shape[1:]
         around = np.any([wide[:, y : y + rows, x : x + columns] for y in range(3) for x in range(3)], axis=0)
