@@ -213,7 +213,7 @@ def near_photons(
 ) -> vec8: ...
 
 
-# Place of the nearest lane, -1: none.
+# Place of the nearest lane whose own radius, times the root of `reach2`, covers the point; -1: none.
 NEAREST_PLACE = (
     LANES_HEAD
     + AT_POINT
@@ -223,14 +223,14 @@ NEAREST_PLACE = (
                     worst = m2[j];
                     found = block * 8 + j;
 """,
-        FACING,
+        FACING + " & (m2[j] <= reach2 * p[48 + j])",
     ).replace("(d2[j] > 0.0f) & ", "")
     + "    return found;\n"
 )
 
 
 @wp.func_native(NEAREST_PLACE)
-def nearest_place(tree: SplatTree, x: wp.vec3, n: wp.vec3, stretch: float, facing: float) -> int: ...
+def nearest_place(tree: SplatTree, x: wp.vec3, n: wp.vec3, stretch: float, facing: float, reach2: float) -> int: ...
 
 
 # The k-th photon of a search nearby is rarely farther, by the squares.
@@ -263,7 +263,10 @@ class Density:
 def share_on_surface(scene: Scene, look: Lookup, x: wp.vec3, n: wp.vec3, radius: float, key: int, index: int):
     """Part of the kernel's disc that lies on the surface and in sight: beyond it no photon could have come to be."""
     frame = make_frame(n)
-    o = x + n * (look.lift * radius)
+    # from some height, so that the rays meet curved surfaces, but under what hangs over x
+    above = closest_hit(scene, x + n * (1.0e-3 * radius), n)
+    lift = wp.min(look.lift * radius, 0.5 * above.t)
+    o = x + n * lift
     inside = float(0.0)
     total = float(0.0)
     for j in range(look.probes):
@@ -272,12 +275,12 @@ def share_on_surface(scene: Scene, look: Lookup, x: wp.vec3, n: wp.vec3, radius:
         disc = square_to_disc(sample_2d(sampler, 0))
         w = kernel_weight(wp.min(wp.dot(disc, disc), 0.999999), look.shape)
         total = total + w
-        along = (frame.s * disc[0] + frame.t * disc[1]) * radius - n * (look.lift * radius)
+        along = (frame.s * disc[0] + frame.t * disc[1]) * radius - n * lift
         length = wp.length(along)
         d = along / length
         hit = closest_hit(scene, o, d)
         if hit.face >= 0:
-            height = look.lift * radius * wp.abs(1.0 - hit.t / length)
+            height = lift * wp.abs(1.0 - hit.t / length)
             same = wp.abs(wp.dot(scene.face_normals[hit.face], n)) > look.facing
             if same and height * height * (1.0 + look.stretch) < radius * radius:
                 inside = inside + w
@@ -303,7 +306,7 @@ def density(tree: SplatTree, scene: Scene, look: Lookup, x: wp.vec3, n: wp.vec3,
         share = float(1.0)
         if look.probes > 0:
             share = share_on_surface(scene, look, x, n, wp.sqrt(found[3]), key, index)
-            result.rays = look.probes
+            result.rays = look.probes + 1
             if share <= 0.0:
                 share = 1.0
         result.irradiance = wp.vec3(found[0], found[1], found[2]) / (PI * found[3] * share)

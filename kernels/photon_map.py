@@ -20,7 +20,6 @@ from warpgi.kernels.scene import (
     ShapeRecord,
     Surface,
     closest_hit,
-    occluded,
     offset_origin,
     surface_at,
 )
@@ -47,6 +46,7 @@ class Maps:
     irradiance: SplatTree  # for gathering: irradiance of all light at some photons, radius in place of their size
     caustic_look: Lookup
     diffuse_look: Lookup
+    reach2: float  # squared radii from such a point, where few photons make a radius
     near: float  # hits nearer than so many radii are no good for gathering, squared
 
 
@@ -80,9 +80,10 @@ def estimate_at(offset: int, scene: Scene, photons: SplatTree, look: Lookup, see
 
 @wp.func
 def irradiance_near(maps: Maps, x: wp.vec3, n: wp.vec3):
-    """That of the nearest point at which it is known (Christensen 1999)."""
+    """That of the nearest point at which it is known, and whose estimate reaches here (Christensen 1999)."""
     result = Density()
-    place = nearest_place(maps.irradiance, x, n, maps.diffuse_look.stretch, maps.diffuse_look.facing)
+    look = maps.diffuse_look
+    place = nearest_place(maps.irradiance, x, n, look.stretch, look.facing, maps.reach2)
     if place >= 0:
         k = (place // LANES) * BLOCK_STRIDE + place % LANES
         b = maps.irradiance.blocks
@@ -95,25 +96,22 @@ def irradiance_near(maps: Maps, x: wp.vec3, n: wp.vec3):
 class Incident:
     """Light that came along a gather ray."""
 
-    radiance: wp.vec3  # from diffuse surfaces; caustics and lights at the ray's end are not in it
-    environment: wp.vec3  # seen without anything between
+    radiance: wp.vec3  # that a diffuse surface reflected last; caustics are not in it
+    direct: wp.vec3  # of lights that the ray met first, weighted against light sampling
     distance: float  # to the first hit, FAR: none
     closest_hit_rays: int
     shadow_rays: int
 
 
 @wp.func
-def sampled_light(scene: Scene, shape: ShapeRecord, s: Surface, n: wp.vec3, wo: wp.vec3, sampler: Sampler, pair: int):
-    """Direct light at a diffuse surface by light sampling alone."""
-    return direct_light(scene, shape, s, n, wo, sample_2d(sampler, pair), sample_2d(sampler, pair + 1)[0], 0.0)
-
-
-@wp.func
-def incident_light(scene: Scene, maps: Maps, sampler: Sampler, key: int, index: int, o_: wp.vec3, d_: wp.vec3):
-    """Light from o along d that was last reflected by a diffuse surface, over any others in between.
+def incident_light(
+    scene: Scene, maps: Maps, sampler: Sampler, key: int, index: int, o_: wp.vec3, d_: wp.vec3, first_pdf: float
+):
+    """Light from o along d that is direct or was last reflected by a diffuse surface, over any others in between.
 
     Where the map's radius reaches back to the ray's origin the map would mix up the two surfaces of a corner: the ray
-    goes on from there, with light and caustics of that point added.
+    goes on from there, with light and caustics of that point added. `first_pdf` is the density of d where light
+    sampling at o shares what it meets, else 0.
     """
     o = o_
     d = d_
@@ -122,22 +120,29 @@ def incident_light(scene: Scene, maps: Maps, sampler: Sampler, key: int, index: 
     throughput = wp.vec3(1.0)
     travelled = float(0.0)
     near = int(0)
+    pdf = first_pdf
     direct = int(1)  # nothing but a diffuse surface, or the beginning, is behind
     for step in range(MAX_CHAIN):
         hit = closest_hit(scene, o, d)
         result.closest_hit_rays = result.closest_hit_rays + 1
-        if hit.face < 0:
-            if step == 0:
-                result.environment = scene.environment
-            elif direct == 1:
-                result.radiance = result.radiance + wp.cw_mul(throughput, scene.environment)
-            break
-        if step == 0:
-            result.distance = hit.t
-        travelled = travelled + hit.t
-        shape = scene.shapes[scene.face_shapes[hit.face]]
-        s = surface_at(scene, hit, shape)
+        light = scene.environment
+        shape = ShapeRecord()
+        s = Surface()
         wo = -d
+        if hit.face >= 0:
+            shape = scene.shapes[scene.face_shapes[hit.face]]
+            s = surface_at(scene, hit, shape)
+            light = emitted(shape, s.ng, wo)
+            if direct == 1 and wp.max(light) > 0.0:
+                light = light * emission_weight(shape, s.ng, d, hit.t, pdf)
+        if step == 0:
+            result.direct = light
+            result.distance = hit.t
+        elif direct == 1:
+            result.radiance = result.radiance + wp.cw_mul(throughput, light)
+        if hit.face < 0:
+            break
+        travelled = travelled + hit.t
         n = s.n
         if shape.kind != DIELECTRIC:
             n = facing_normal(s, wo)
@@ -153,9 +158,10 @@ def incident_light(scene: Scene, maps: Maps, sampler: Sampler, key: int, index: 
             travelled = 0.0
             direct = 1
             if scene.light_count > 0:
-                light = sampled_light(scene, shape, s, n, wo, sampler, pair)
-                result.shadow_rays = result.shadow_rays + light.shadow_rays
-                result.radiance = result.radiance + wp.cw_mul(throughput, light.radiance)
+                choice = sample_2d(sampler, pair + 1)[0]
+                sampled = direct_light(scene, shape, s, n, wo, sample_2d(sampler, pair), choice, 1.0)
+                result.shadow_rays = result.shadow_rays + sampled.shadow_rays
+                result.radiance = result.radiance + wp.cw_mul(throughput, sampled.radiance)
             caustic = density(maps.caustic, scene, maps.caustic_look, s.p, n, 0.0, key, index)
             result.closest_hit_rays = result.closest_hit_rays + caustic.rays
             reflected = wp.cw_mul(throughput, wp.cw_mul(s.albedo, caustic.irradiance)) * INV_PI
@@ -164,6 +170,7 @@ def incident_light(scene: Scene, maps: Maps, sampler: Sampler, key: int, index: 
         if wp.max(b.weight) <= 0.0 or (b.transmitted == 0 and not reflects(s, wo, b.wi)):
             break
         throughput = wp.cw_mul(throughput, b.weight)
+        pdf = b.pdf
         o = offset_origin(s.p, s.ng, s.offset, b.wi)
         d = b.wi
     return result
@@ -197,11 +204,22 @@ def gather_irradiance(
     for ray in range(view.gather):
         d = gather_direction(view.seed, view.sampler, i, ray, normals[i])
         sampler = make_sampler(view.seed, i, ray, view.sampler)
-        light = incident_light(scene, maps, sampler, i, view.seed, points[i], d)
+        light = incident_light(scene, maps, sampler, i, view.seed, points[i], d, 0.0)
         total = total + light.radiance
         inverse = inverse + 1.0 / light.distance
     irradiance[i] = total * (PI / float(view.gather))
     inverse_distance[i] = inverse / float(view.gather)
+
+
+@wp.func
+def visible_light(scene: Scene, o: wp.vec3, d: wp.vec3, pdf: float):
+    """Light that a ray meets first, weighted against light sampling."""
+    hit = closest_hit(scene, o, d)
+    if hit.face < 0:
+        return scene.environment
+    shape = scene.shapes[scene.face_shapes[hit.face]]
+    ng = scene.face_normals[hit.face]
+    return emitted(shape, ng, -d) * emission_weight(shape, ng, d, hit.t, pdf)
 
 
 @wp.func
@@ -237,21 +255,18 @@ def follow(scene: Scene, maps: Maps, view: View, pixel: int, index: int, sampler
         pair = CAMERA_PAIRS + VERTEX_PAIRS * (depth - 1)
 
         if shape.kind == DIFFUSE:
-            # direct light
-            share = 1.0 / float(view.light_samples)
-            for j in range(view.light_samples):
-                light_sampler = make_sampler(view.seed, pixel, index * view.light_samples + j, view.sampler)
-                if scene.light_count > 0:
-                    light = sampled_light(scene, shape, s, n, wo, light_sampler, pair)
+            # direct light, by lights and by directions (Veach 1997)
+            rays = wp.where(view.gather > 0, view.gather, wp.where(scene.visible_light != 0, view.light_samples, 0))
+            light_part = 1.0 / float(view.light_samples)
+            ray_part = 1.0 / float(wp.max(rays, 1))
+            if scene.light_count > 0:
+                for j in range(view.light_samples):
+                    light_sampler = make_sampler(view.seed, pixel, index * view.light_samples + j, view.sampler)
+                    u = sample_2d(light_sampler, pair)
+                    choice = sample_2d(light_sampler, pair + 2)[0]
+                    light = direct_light(scene, shape, s, n, wo, u, choice, float(rays) * light_part)
                     path.shadow_rays = path.shadow_rays + light.shadow_rays
-                    path = add_light(path, depth + 1, wp.cw_mul(throughput, light.radiance) * share)
-                if view.gather == 0 and wp.max(scene.environment) > 0.0:
-                    wi = to_world(make_frame(n), square_to_cosine_hemisphere(sample_2d(light_sampler, pair + 2)))
-                    path.shadow_rays = path.shadow_rays + 1
-                    if reflects(s, wo, wi) and not occluded(scene, offset_origin(s.p, s.ng, s.offset, wi), wi, FAR):
-                        sky = wp.cw_mul(s.albedo, scene.environment) * share
-                        path = add_light(path, depth + 1, wp.cw_mul(throughput, sky))
-            # caustics, and the rest of the map or what gather rays bring of it
+                    path = add_light(path, depth + 1, wp.cw_mul(throughput, light.radiance) * light_part)
             found = density(maps.caustic, scene, maps.caustic_look, s.p, n, 0.0, pixel, index)
             path.closest_hit_rays = path.closest_hit_rays + found.rays
             irradiance = found.irradiance
@@ -259,26 +274,25 @@ def follow(scene: Scene, maps: Maps, view: View, pixel: int, index: int, sampler
                 found = density(maps.diffuse, scene, maps.diffuse_look, s.p, n, 0.0, pixel, index)
                 path.closest_hit_rays = path.closest_hit_rays + found.rays
                 irradiance = irradiance + found.irradiance
-            else:
-                gathered = wp.vec3(0.0)
-                sky = wp.vec3(0.0)
-                for ray in range(view.gather):
-                    number = index * view.gather + ray
-                    wi = gather_direction(view.seed, view.sampler, pixel, number, n)
-                    if reflects(s, wo, wi):
+            reflectance = wp.cw_mul(throughput, s.albedo)
+            for ray in range(rays):
+                number = index * rays + ray
+                wi = gather_direction(view.seed, view.sampler, pixel, number, n)
+                if reflects(s, wo, wi):
+                    o = offset_origin(s.p, s.ng, s.offset, wi)
+                    ray_pdf = wp.dot(n, wi) * INV_PI * float(rays) * light_part
+                    if view.gather > 0:
                         ray_sampler = make_sampler(view.seed, pixel, number, view.sampler)
-                        o = offset_origin(s.p, s.ng, s.offset, wi)
-                        incident = incident_light(scene, maps, ray_sampler, pixel, index, o, wi)
+                        incident = incident_light(scene, maps, ray_sampler, pixel, index, o, wi, ray_pdf)
                         path.closest_hit_rays = path.closest_hit_rays + incident.closest_hit_rays
                         path.shadow_rays = path.shadow_rays + incident.shadow_rays
-                        gathered = gathered + incident.radiance
-                        sky = sky + incident.environment
-                part = PI / float(view.gather)
-                irradiance = irradiance + gathered * part
-                sky = wp.cw_mul(s.albedo, sky) / float(view.gather)
-                path = add_light(path, depth + 1, wp.cw_mul(throughput, sky))
-            reflected = wp.cw_mul(s.albedo, irradiance) * INV_PI
-            path = add_light(path, depth + 2, wp.cw_mul(throughput, reflected))
+                        path = add_light(path, depth + 1, wp.cw_mul(reflectance, incident.direct) * ray_part)
+                        path = add_light(path, depth + 2, wp.cw_mul(reflectance, incident.radiance) * ray_part)
+                    else:
+                        path.closest_hit_rays = path.closest_hit_rays + 1
+                        seen = visible_light(scene, o, wi, ray_pdf)
+                        path = add_light(path, depth + 1, wp.cw_mul(reflectance, seen) * ray_part)
+            path = add_light(path, depth + 2, wp.cw_mul(reflectance, irradiance) * INV_PI)
             break
 
         # anything else: rough metal samples lights as well

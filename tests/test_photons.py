@@ -66,7 +66,7 @@ def search(
     i = offset + wp.tid()
     result[i] = nearest_photons(tree, x[i], n[i], k, guess2, limit2, 1.0, stretch, facing, 0)
     near[i] = near_photons(tree, x[i], n[i], limit2, stretch, facing, 0)
-    place[i] = nearest_place(tree, x[i], n[i], stretch, facing)
+    place[i] = nearest_place(tree, x[i], n[i], stretch, facing, 0.25)
 
 
 @wp.kernel
@@ -172,8 +172,9 @@ def test_kinds_of_photons():
     first = first[shot.stored > 0]
     assert (kind[first] == DIRECT).all()
     assert (np.delete(kind, first) == INDIRECT).all()
-    floor = gi.Shape(np.multiply(PANE[0], (20, 1, 20)) + (0, -1, 0), [f[::-1] for f in PANE[1]], gi.Diffuse(0.5))
-    mirror = gi.Shape(np.multiply(PANE[0], (20, 1, 20)) + (0, 1, 0), PANE[1], gi.Mirror(1.0))
+    wide = np.multiply(PANE[0], (20, 1, 20))
+    floor = gi.Shape(np.subtract(wide, (0, 1, 0)), [face[::-1] for face in PANE[1]], gi.Diffuse(0.5))
+    mirror = gi.Shape(np.add(wide, (0, 1, 0)), PANE[1], gi.Mirror(1.0))
     up = gi.SpotLight((0, 0, 0), (0, 1, 0), 1.0, 0.1, 0.2)
     kind = arrays(source_of(gi.Scene([floor, mirror], CAMERA, [up])).shoot(1000, 0))[3]
     assert (kind[:1] == CAUSTIC).all()

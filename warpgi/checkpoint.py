@@ -68,7 +68,8 @@ class Checkpoint:
 
     def _read(self) -> None:
         found: dict[str, Any] = {}
-        with suppress(ValueError, KeyError, EOFError, BadZipFile), np.load(self.path, allow_pickle=False) as data:
+        with suppress(ValueError, KeyError, EOFError, BadZipFile), open(self.path, "rb") as file:
+            data = np.load(file, allow_pickle=False)
             found = json.loads(str(data["identity"]))
             self._fields = {name: data[name] for name in FIELDS}
         if not self._fields or "done" not in found:

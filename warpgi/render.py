@@ -194,9 +194,7 @@ def _check_end(method: Method, seconds: float | None, error: float | None, check
         raise TypeError(f"checkpoint is {type(checkpoint).__name__}, expected a path")
     for name, value in (("error", error), ("checkpoint", checkpoint)):
         if value is not None and not getattr(method, "keeps_all_in_film", False):
-            raise ValueError(
-                f"{name} is given, expected None: a picture by {type(method).__name__} is not made of samples"
-            )
+            raise ValueError(f"{name} is given, expected None: {type(method).__name__} keeps more than its film")
 
 
 def _check(scene: Scene, method: Method) -> None:

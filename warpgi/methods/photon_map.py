@@ -22,10 +22,11 @@ from warpgi.splat_tree import SplatTree
 
 # Photons that a path leaves behind, for a guess at memory before any is traced.
 PHOTONS_PER_PATH = 4
-# Probes of the surface start so many radii above it.
-PROBE_LIFT = 0.1
+# Probes of the surface start so many radii above it, or less.
+PROBE_LIFT = 0.5
 # Added to a map's number: paths that only say where irradiance is to be known.
 OTHER_PATHS = 1 << 30
+COVER = 12.0
 # Beyond any scene.
 UNLIMITED = 1e30
 
@@ -92,7 +93,7 @@ class PhotonMap:
     flatten: float = 2.0
     """Factor by which distances along the normal count for more, 1 or above: photons off the surface's plane are left
     out."""
-    edge_rays: int = 0
+    edge_rays: int = 8
     """Short rays per estimate that find which part of its disc is on the surface, against dark edges; 0: none."""
     final_gather: int = 0
     """Rays per camera path that gather indirect light from the map at their hits; 0: the map is seen directly."""
@@ -214,9 +215,11 @@ class Mapping:
         self.number = number
         s, source = self.settings, self.source
         self._trees = []  # before new ones are made
-        scale2 = math.prod((i + s.shrink) / (i + 1.0) for i in range(1, number + 1))
+        scale2 = self.radius_scale2(number)
         maps = kernels.Maps()
         maps.near = s.near**2
+        # a place without a point near enough is as rare as exp(-COVER) where light is even
+        maps.reach2 = max(1.0, COVER * s.gather_stride / (s.neighbours or math.inf))
         maps.diffuse_look = self.lookup(s.neighbours, s.radius, scale2)
         maps.caustic_look = self.lookup(
             s.caustic_neighbours, s.caustic_radius or 0.05 * max(self.job.scene.radius, 1e-30), scale2
@@ -244,6 +247,11 @@ class Mapping:
             maps.caustic = self._tree(shot, empty)
         self.maps = maps
         self.counts["maps"] += 1
+
+    def radius_scale2(self, number: int) -> float:
+        """What is left of the first map's squared radii (Knaus, Zwicker 2011, eq. 21)."""
+        alpha = self.settings.shrink
+        return math.prod((i + alpha) / (i + 1.0) for i in range(1, number + 1))
 
     def lookup(self, neighbours: int, radius: float | None, scale2: float) -> kernels.Lookup:
         """How estimates are made."""
