@@ -20,6 +20,7 @@ from warpgi.kernels.scene import (
     ShapeRecord,
     Surface,
     closest_hit,
+    max_abs,
     offset_origin,
     surface_at,
 )
@@ -31,6 +32,8 @@ wp.set_module_options({"enable_backward": False})
 MAX_CHAIN = wp.constant(16)
 # Diffuse surfaces too near for an estimate, one after the other, of a gather ray; the next is taken as it is.
 MAX_NEAR = wp.constant(4)
+# Coordinates from here on say that a ray met nothing.
+MET = wp.constant(1.0e10)
 # Pairs of random numbers of gather rays begin here, after the camera path's; each of their vertices takes two.
 GATHER_PAIR = wp.constant(CAMERA_PAIRS + VERTEX_PAIRS * MAX_CHAIN)
 # Directions from the first surface take the last pair that is stratified.
@@ -209,6 +212,52 @@ def gather_irradiance(
         inverse = inverse + 1.0 / light.distance
     irradiance[i] = total * (PI / float(view.gather))
     inverse_distance[i] = inverse / float(view.gather)
+
+
+@wp.kernel
+def light_samples(
+    offset: int,
+    scene: Scene,
+    maps: Maps,
+    view: View,
+    step: float,
+    spp: int,
+    hits: int,
+    origins: wp.array[wp.vec3],
+    normals: wp.array[wp.vec3],
+    hit: wp.array[wp.vec3],
+    radiance: wp.array[wp.vec3],
+):
+    """One thread owns one secondary ray, which begins at one of the first `spp` of a pixel's `hits` primary hits: its
+    radiance by the maps, in place of what a path brought. `step` takes the ray off its surface.
+    """
+    k = offset + wp.tid()
+    pixel = k // spp
+    place = pixel * hits + k % spp
+    o = origins[place]
+    if max_abs(o) >= MET or max_abs(hit[k]) >= MET:
+        return
+    d = wp.normalize(hit[k] - o)
+    sampler = make_sampler(view.seed, pixel, k % spp, view.sampler)
+    incident = incident_light(scene, maps, sampler, pixel, k % spp, offset_origin(o, normals[place], step, d), d, 0.0)
+    radiance[k] = incident.radiance
+
+
+@wp.kernel
+def caustics_at(
+    offset: int,
+    scene: Scene,
+    maps: Maps,
+    origins: wp.array[wp.vec3],
+    normals: wp.array[wp.vec3],
+    albedo: wp.array[wp.vec3],
+    reflected: wp.array[wp.vec3],
+):
+    """One thread owns one primary hit: the caustic light that it reflects."""
+    i = offset + wp.tid()
+    if max_abs(origins[i]) < MET:
+        found = density(maps.caustic, scene, maps.caustic_look, origins[i], normals[i], 0.0, i, 0)
+        reflected[i] = wp.cw_mul(albedo[i], found.irradiance) * INV_PI
 
 
 @wp.func

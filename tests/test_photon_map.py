@@ -103,8 +103,8 @@ def test_progress_converges_at_the_published_rate():
     late = np.array([np.mean(found[n // 2 : n], axis=0) for n in ends])
     bias, variance = 1.0 - late.mean(axis=1), late.var(axis=1, ddof=1)
     slopes = [np.polyfit(np.log(ends), np.log(values), 1)[0] for values in (bias, variance)]
-    # over log 8 an error of e at the ends tilts the line by e sqrt(2) / 2.08 at most: 2 % of the bias, 7 % of a variance
-    # over 400; the bias is r^2 but for its square, which at a radius of 0.3 is 0.03 of it
+    # over log 8 an error of e at the ends tilts the line by e sqrt(2) / 2.08 at most: 2 % of the bias, 7 % of a
+    # variance over 400; the bias is r^2 but for its square, which at a radius of 0.3 is 0.03 of it
     assert slopes[0] == pytest.approx(alpha - 1.0, abs=0.03 + 3.0 * 0.02 * 0.68)
     assert slopes[1] == pytest.approx(-alpha, abs=3.0 * 0.07 * 0.68)
 

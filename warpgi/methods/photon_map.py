@@ -16,8 +16,11 @@ from warpgi.job import Job
 from warpgi.kernels import bvh, density, rng
 from warpgi.kernels import photon_map as kernels
 from warpgi.kernels import photons as photon_kernels
+from warpgi.kernels.scene import OFFSET_ULPS
 from warpgi.methods.path import Sampler
 from warpgi.photons import BATCH_BYTES, PHOTON_BYTES, TREE_BYTES, PhotonSource
+from warpgi.reconstruction import PrimaryHits
+from warpgi.samples import SampleBuffer
 from warpgi.splat_tree import SplatTree
 
 # Photons that a path leaves behind, for a guess at memory before any is traced.
@@ -275,3 +278,24 @@ class Mapping:
         self.counts["photon_rays"] += shot.rays
         self.counts["nonfinite_photons"] += shot.dropped
         self.counts[what] += shot.count
+
+
+def light_by_photons(job: Job, photons: int, samples: SampleBuffer, hits: PrimaryHits) -> wp.array:
+    """Gives the samples' secondary rays the radiance that a photon map knows at their ends.
+
+    Returns:
+        The caustic light that each primary hit reflects, vec3 on the device: the maps' samples hold none.
+    """
+    device = job.device
+    mapping = Mapping(PhotonMap(photons=photons, caustic_photons=photons, final_gather=1), job)
+    mapping.use(0)
+    origins, normals, albedo = (device.array(a, wp.vec3) for a in (hits.origin, hits.normal, hits.albedo))
+    radiance = device.array(samples.radiance, wp.vec3)
+    step = float(OFFSET_ULPS) * job.scene.radius
+    inputs = [job.scene.struct, mapping.maps, mapping.view, step, samples.spp, hits.per_pixel, origins, normals]
+    device.launch(kernels.light_samples, len(samples), [*inputs, device.array(samples.hit, wp.vec3)], [radiance])
+    samples.radiance[:] = radiance.numpy()
+    caustics = device.zeros(len(hits.origin), wp.vec3)
+    inputs = [job.scene.struct, mapping.maps, origins, normals, albedo]
+    device.launch(kernels.caustics_at, len(hits.origin), inputs, [caustics])
+    return caustics
