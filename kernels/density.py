@@ -237,6 +237,10 @@ def nearest_place(tree: SplatTree, x: wp.vec3, n: wp.vec3, stretch: float, facin
 GUESS_NEARBY = wp.constant(1.5)
 
 
+# A few probes cannot tell a small part from a smaller one, and one near the rim weighs next to nothing.
+LEAST_SHARE = wp.constant(0.125)
+
+
 @wp.struct
 class Lookup:
     """How the light at a point is made from photons."""
@@ -308,6 +312,7 @@ def density(tree: SplatTree, scene: Scene, look: Lookup, x: wp.vec3, n: wp.vec3,
             share = share_on_surface(scene, look, x, n, wp.sqrt(found[3]), key, index)
             result.rays = look.probes + 1
             if share <= 0.0:
-                share = 1.0
+                share = 1.0  # nothing is known
+            share = wp.max(share, LEAST_SHARE)
         result.irradiance = wp.vec3(found[0], found[1], found[2]) / (PI * found[3] * share)
     return result

@@ -5,7 +5,7 @@ import warp as wp
 from warpgi.kernels.bsdf import sample
 from warpgi.kernels.bvh import BLOCK_STRIDE, LANES, RADIUS_ROW
 from warpgi.kernels.camera import Camera
-from warpgi.kernels.density import Density, Lookup, density, nearest_place
+from warpgi.kernels.density import GUESS_NEARBY, Density, Lookup, density, nearest_photons, nearest_place
 from warpgi.kernels.direct import add_features, direct_light, emission_weight, emitted, facing_normal, reflects
 from warpgi.kernels.film import Film, PathSample, add_sample
 from warpgi.kernels.path import CAMERA_PAIRS, VERTEX_PAIRS, add_light, pixel_ray
@@ -24,7 +24,7 @@ from warpgi.kernels.scene import (
     offset_origin,
     surface_at,
 )
-from warpgi.kernels.splats import SplatTree
+from warpgi.kernels.splats import SplatTree, vec8
 
 wp.set_module_options({"enable_backward": False})
 
@@ -79,6 +79,25 @@ def estimate_at(offset: int, scene: Scene, photons: SplatTree, look: Lookup, see
             points.blocks[k + RADIUS_ROW] = found.radius2
             for axis in range(3):
                 points.blocks[k + (7 + axis) * LANES] = found.irradiance[axis]
+
+
+@wp.kernel
+def nearest_of_each(
+    offset: int,
+    photons: SplatTree,
+    points: wp.array[wp.vec3],
+    normals: wp.array[wp.vec3],
+    k: int,
+    stretch: float,
+    facing: float,
+    found: wp.array[vec8],
+):
+    """One thread owns eight points that follow each other, and finds the k nearest photons of each."""
+    first = 8 * (offset + wp.tid())
+    guess2 = float(0.0)
+    for i in range(first, wp.min(first + 8, points.shape[0])):
+        found[i] = nearest_photons(photons, points[i], normals[i], k, guess2, 1.0e30, 1.0, stretch, facing, 0)
+        guess2 = GUESS_NEARBY * found[i][5]
 
 
 @wp.func
