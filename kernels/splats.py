@@ -12,7 +12,7 @@ wp.set_module_options({"enable_backward": False})
 
 MAX_NEIGHBOURS = 32  # the length of the arrays in NEAREST
 
-vec8 = wp.types.vector(length=8, dtype=wp.float32)
+vec9 = wp.types.vector(length=9, dtype=wp.float32)
 
 
 @wp.struct
@@ -25,7 +25,7 @@ class SplatTree:
 
 
 # Squared distance to the k-th neighbour in the metric |d|^2 + stretch (d.n)^2, the sample itself counted, and in
-# Euclid's; samples at the very same place are not neighbours, or they would vanish.
+# Euclid's; samples at the very same place are not neighbours, or they would vanish, nor are those that face elsewhere.
 NEAREST = (
     LANES_HEAD
     + """
@@ -76,7 +76,9 @@ NEAREST = (
                 const float along = dx * nx + dy * ny + dz * nz;
                 d2[j] = dx * dx + dy * dy + dz * dz;
                 m2[j] = d2[j] + stretch * along * along;
-                met[j] = (int)((p[48 + j] >= 0.0f) & (d2[j] > 0.0f) & (m2[j] < worst));
+                // what faces elsewhere is another surface, or the other side of something thin
+                const float same = p[24 + j] * nx + p[32 + j] * ny + p[40 + j] * nz;
+                met[j] = (int)((p[48 + j] >= 0.0f) & (d2[j] > 0.0f) & (m2[j] < worst) & (same > 0.1f));
             }
             unsigned mask = lane_mask(met);
             while (mask) {
@@ -243,8 +245,9 @@ def shrink_crossed(
 # conflicts where its event line meets the st plane in the positive, or in the negative, half-spaces of both (with the
 # authors' erratum); that is a b depth_i depth_j > 0 for a = (h_j - h_i).n_i and b = (h_j - h_i).n_j.
 # `keep_one` and `keep_two` are squared parts of their radius that splats keep which are alone, or two, in the surface.
-# Returns radiance times weight (3), weight, weight of splats nearer than `reach`, splats in the surface, and whether
-# the gather was cut short and how many undersampled surfaces were passed through.
+# Returns radiance times weight (3), weight, weight of splats nearer than `reach`, splats in the surface, whether
+# the gather was cut short, how many undersampled surfaces were passed through, and the distance of a surface whose
+# splats all face away, else 0.
 SURFACE = (
     WALK_HEAD
     + """
@@ -388,9 +391,16 @@ SURFACE = (
             within += t_of[j] < reach ? w : 0.0f;
         }
     }
-    wp::vec_t<8, wp::float32> result;
+    float seen_behind = 0.0f;
+    if (!any_front && inside > 0) {
+        seen_behind = 1.0e30f;
+        for (int j = 0; j < size; ++j)
+            seen_behind = smaller(seen_behind, t_of[j]);
+    }
+    wp::vec_t<9, wp::float32> result;
     result[0] = r; result[1] = g; result[2] = b; result[3] = weight; result[4] = within;
     result[5] = (float)inside; result[6] = (float)cut; result[7] = (float)surfaces_passed;
+    result[8] = seen_behind;
     return result;
 """
 )
@@ -399,4 +409,79 @@ SURFACE = (
 @wp.func_native(SURFACE)
 def first_surface(
     tree: SplatTree, o: wp.vec3, d: wp.vec3, noise: float, reach: float, keep_one: float, keep_two: float
-) -> vec8: ...
+) -> vec9: ...
+
+
+# The splat nearest to x among those that face a ray along d; -1 if none does.
+NEAREST_FACING = (
+    LANES_HEAD
+    + """
+    int stack[128];
+    float entry[128];
+    int top = 1;
+    stack[0] = 0;
+    entry[0] = 0.0f;
+    float best = 1.0e30f;
+    int nearest = -1;
+    while (top > 0) {
+        --top;
+        if (entry[top] >= best)
+            continue;
+        const int current = stack[top];
+        float d2[8];
+        int met[8];
+        if (current < 0) {
+            const int block = -1 - current;
+            const float* p = tree.blocks.data + (size_t)block * 80;
+            for (int j = 0; j < 8; ++j) {
+                const float dx = p[j] - x[0], dy = p[8 + j] - x[1], dz = p[16 + j] - x[2];
+                d2[j] = dx * dx + dy * dy + dz * dz;
+                const float facing = p[24 + j] * d[0] + p[32 + j] * d[1] + p[40 + j] * d[2];
+                met[j] = (int)((p[48 + j] >= 0.0f) & (facing < 0.0f) & (d2[j] < best));
+            }
+            unsigned mask = lane_mask(met);
+            while (mask) {
+                const int j = next_lane(mask);
+                if (d2[j] < best) {
+                    best = d2[j];
+                    nearest = block * 8 + j;
+                }
+            }
+        } else {
+            const float* p = tree.nodes.data + (size_t)current * 48;
+            for (int j = 0; j < 8; ++j) {
+                const float dx = larger(larger(p[j] - x[0], x[0] - p[24 + j]), 0.0f);
+                const float dy = larger(larger(p[8 + j] - x[1], x[1] - p[32 + j]), 0.0f);
+                const float dz = larger(larger(p[16 + j] - x[2], x[2] - p[40 + j]), 0.0f);
+                d2[j] = dx * dx + dy * dy + dz * dz;
+                met[j] = (int)(d2[j] < best);
+            }
+            const int first = tree.first.data[current];
+            const int base = top;
+            unsigned mask = lane_mask(met);
+            while (mask) {
+                const int j = next_lane(mask);
+                int slot = top++;
+                while (slot > base && entry[slot - 1] < d2[j]) {
+                    entry[slot] = entry[slot - 1];
+                    stack[slot] = stack[slot - 1];
+                    --slot;
+                }
+                entry[slot] = d2[j];
+                stack[slot] = first >= 0 ? first + j : first - j;
+            }
+        }
+    }
+    return nearest;
+"""
+)
+
+
+@wp.func_native(NEAREST_FACING)
+def nearest_facing(tree: SplatTree, x: wp.vec3, d: wp.vec3) -> int: ...
+
+
+@wp.func
+def splat_radiance(tree: SplatTree, splat: int):
+    at = (splat // 8) * 80 + splat % 8 + 56
+    return wp.vec3(tree.blocks[at], tree.blocks[at + 8], tree.blocks[at + 16])
