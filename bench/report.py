@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import platform
 import subprocess
 from collections.abc import Sequence
@@ -122,3 +123,12 @@ def write_json(path: Path, circumstances: dict[str, Any], settings: dict[str, An
     """Writes everything to `path`."""
     content = {**circumstances, "settings": settings, "rows": [asdict(item) for item in rows]}
     path.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+
+
+def finite(value: Any) -> Any:
+    """The same plain JSON with null where a number is infinite or none, as the PSNR of equal pictures is."""
+    if isinstance(value, dict):
+        return {key: finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
