@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import Progress
 
 import warpgi as gi
 from bench.chart_page import PAGE, RESULTS, RUNS, write_page
@@ -19,7 +18,7 @@ from bench.chart_report import Point, equal_error, equal_time, lines, pareto_fro
 from bench.contender import Contender, Place, Run, Settings, label
 from bench.contenders import contenders
 from bench.reference import CACHE, Reference, make_reference
-from bench.report import circumstances, cpu_model, finite
+from bench.report import circumstances, cpu_model, finite, progress
 from bench.runs import RunStore
 from warpgi import checks
 from warpgi.__main__ import open_scene
@@ -93,7 +92,6 @@ class Chart:
         self.references: dict[str, Reference] = {}
         self.loaded: dict[tuple[str, str], Callable[[Settings, int], Run]] = {}
         self.finished: dict[str, tuple[Run, dict[str, Any]]] = {}  # by the words of the task; without pictures
-        self.console = Console(stderr=True)
 
     def measure(self) -> None:
         """Does all that is missing; may be interrupted at any time, and continued."""
@@ -104,14 +102,13 @@ class Chart:
                     self.loaded[name, contender.name] = contender.load(place)
                 except ValueError as error:
                     self.notes.append(f"{contender.name} is left out on {name}: {error}")
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-        with Progress(*columns, console=self.console, transient=True) as bar:
+        with progress() as bar:
             for name in self.scenes:
                 self.references[name] = self._reference(name, bar)
             tasks = list(self.tasks())
             missing = [task for task in tasks if not self.recall(task)]
             if len(missing) < len(tasks):
-                self.console.print(f"{len(tasks) - len(missing)} of {len(tasks)} runs were done before")
+                bar.console.print(f"{len(tasks) - len(missing)} of {len(tasks)} runs were done before")
             job = bar.add_task("", total=len(missing))
             warm: set[tuple[str, str]] = set()
             for task in missing:
@@ -121,7 +118,7 @@ class Chart:
                     warm.add((task.scene, task.contender.name))
                 run = self.loaded[task.scene, task.contender.name](task.settings, task.seed)
                 errors = self.keep(task, run)
-                self.console.print(f"{task}: {run.seconds:.3g} s, relMSE {errors['relmse']:.3g}", highlight=False)
+                bar.console.print(f"{task}: {run.seconds:.3g} s, relMSE {errors['relmse']:.3g}", highlight=False)
                 bar.advance(job)
 
     def _reference(self, scene: str, bar: Progress) -> Reference:

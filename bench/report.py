@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from warpgi.device import Device
@@ -80,6 +81,12 @@ def scaled(item: Row) -> tuple[float, str]:
             if item.value >= scale:
                 return scale, f"{prefix}{item.unit}" if item.unit == "B" else f"{prefix} {item.unit}"
     return 1.0, item.unit
+
+
+def progress() -> Progress:
+    """A bar on standard error, gone when it is done."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    return Progress(*columns, console=Console(stderr=True), transient=True)
 
 
 def circumstances(device: Device, versions: dict[str, str]) -> dict[str, Any]:

@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 import warpgi as gi
 from bench.chart_page import PAGE, RESULTS, STABILITY, write_page
 from bench.failures import ambient_occlusion, light_field, path
 from bench.failures.failure import Failure
-from bench.report import circumstances, finite
+from bench.report import circumstances, finite, progress
 from warpgi.image import atomic_write
 
 #: All rows; a method adds those of its own file.
@@ -58,8 +57,7 @@ def run(out: Path, methods: tuple[str, ...] = (), device: str | None = None, thr
 def measure(failures: Sequence[Failure], device: gi.Device) -> list[dict[str, Any]]:
     """A row of plain values for each failure."""
     rows = []
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    with progress() as bar:
         task = bar.add_task("", total=len(failures))
         for failure in failures:
             bar.update(task, description=f"{failure.method}, {failure.scene}")
