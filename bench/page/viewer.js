@@ -183,7 +183,9 @@ class Viewer {
   wheel(event) {
     if (!this.a) return;
     event.preventDefault();
-    this.zoomTo(this.zoom * 2 ** (-event.deltaY / 240), this.spot(event));
+    const spot = this.spot(event);
+    this.zoomTo(this.zoom * 2 ** (-event.deltaY / 240), spot);
+    this.read(...spot);
   }
 
   key(event) {
