@@ -102,6 +102,7 @@ def chart_command(
     device: str | None = None,
     threads: int | None = None,
     out: Path = Path("out/chart"),
+    picture: Path | None = None,
     quick: bool = False,
     fresh: bool = False,
 ) -> None:
@@ -120,11 +121,12 @@ def chart_command(
         device: cpu, cuda, cuda:0, ...; a GPU if there is one.
         threads: CPU threads; all by default.
         out: Folder for results.json, chart.png, index.html, and the finished runs.
+        picture: Where the chart goes as a PNG instead of chart.png in that folder.
         quick: A small chart within three minutes: 64 x 64 pixels, few settings, one repeat, a reference of 1024 spp.
         fresh: Forget the finished runs in that folder.
     """
     settings = chart.ChartSettings(device, scene, size, methods, repeats, seed, reference_spp, max_depth, threads)
-    chart.run(settings.made_quick() if quick else settings, out, fresh)
+    chart.run(settings.made_quick() if quick else settings, out, fresh, picture)
 
 
 def stability_command(

@@ -22,7 +22,7 @@ from bench.report import circumstances, cpu_model, finite, progress
 from bench.runs import RunStore
 from warpgi import checks
 from warpgi.__main__ import open_scene
-from warpgi.image import atomic_write
+from warpgi.image import atomic_write, check_output
 
 NO_PICTURE = np.zeros((0, 0, 3), np.float32)
 
@@ -254,8 +254,14 @@ class Chart:
         }
 
 
-def run(settings: ChartSettings, out: Path, fresh: bool) -> None:
+def run(settings: ChartSettings, out: Path, fresh: bool, picture: Path | None = None) -> None:
     """Measures, prints the tables and writes results.json, chart.png and index.html into a folder.
+
+    Args:
+        settings: what to measure.
+        out: the folder, made where it is missing.
+        fresh: forget the runs that are finished there.
+        picture: where chart.png goes instead.
 
     Raises:
         ValueError: a setting is wrong.
@@ -263,6 +269,7 @@ def run(settings: ChartSettings, out: Path, fresh: bool) -> None:
         KeyboardInterrupt: after a report of what was finished.
     """
     out.mkdir(parents=True, exist_ok=True)
+    picture = check_output(picture or out / PICTURE)
     chart = Chart(settings, out)
     if fresh:
         chart.store.clear()
@@ -270,12 +277,12 @@ def run(settings: ChartSettings, out: Path, fresh: bool) -> None:
         chart.measure()
     except KeyboardInterrupt:
         if chart.finished:
-            report(chart)
+            report(chart, picture)
         raise
-    report(chart)
+    report(chart, picture)
 
 
-def report(chart: Chart) -> None:
+def report(chart: Chart, picture: Path) -> None:
     """Prints and writes what is finished."""
     for note in chart.notes:
         print(note)
@@ -288,7 +295,7 @@ def report(chart: Chart) -> None:
     write_page(chart.out)
     print(f"wrote {chart.out / RESULTS}\nwrote {chart.out / PAGE}")
     try:
-        draw(chart.out / PICTURE, results)
-        print(f"wrote {chart.out / PICTURE}")
+        draw(picture, results)
+        print(f"wrote {picture}")
     except ImportError as error:
-        print(f"no {PICTURE}: {error}")
+        print(f"no {picture.name}: {error}")
