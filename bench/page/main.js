@@ -142,7 +142,7 @@ function stability() {
   }
   const table = node("table", {}, node("tr", {}, ...["method", "scene", "what is measured", "value", "bound", ""].map((t, i) => node("th", { scope: "col", class: i < 3 ? "text" : "" }, t))));
   for (const row of data.stability.rows) {
-    const value = row.error ? `${short(row.value)} ± ${short(row.error)}` : short(row.value);
+    const value = row.error ? `${short(row.value)} ± ${short(Number(row.error.toPrecision(2)))}` : short(row.value);
     table.append(node("tr", {}, node("td", { class: "text" }, row.method), node("td", { class: "text" }, row.scene), node("td", { class: "text" }, row.what),
       node("td", {}, value), node("td", {}, row.bound === null ? "none" : `≤ ${short(row.bound)}`), node("td", { class: row.verdict }, row.verdict)));
   }
