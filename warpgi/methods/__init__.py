@@ -12,6 +12,7 @@ from warpgi.methods.ambient_occlusion import AmbientOcclusion
 from warpgi.methods.irradiance_filter import IrradianceFilter
 from warpgi.methods.light_field import LightField
 from warpgi.methods.path import PathTracing, Sampler
+from warpgi.methods.photon_map import Kernel, PhotonMap
 from warpgi.methods.random_parameter_filter import RandomParameterFilter
 
 
@@ -57,6 +58,7 @@ METHODS: dict[str, type] = {
     "a-trous": ATrous,
     "random-parameter-filter": RandomParameterFilter,
     "irradiance-filter": IrradianceFilter,
+    "photon-map": PhotonMap,
 }
 
 #: Those that make a picture of a sample buffer alone, and those that filter the layers of a finished one.
@@ -70,9 +72,11 @@ __all__ = [
     "ATrous",
     "AmbientOcclusion",
     "IrradianceFilter",
+    "Kernel",
     "LightField",
     "Method",
     "PathTracing",
+    "PhotonMap",
     "RandomParameterFilter",
     "Sampler",
 ]
