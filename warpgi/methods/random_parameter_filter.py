@@ -47,9 +47,10 @@ class RandomParameterFilter(SampleFilter):
     """Side of each round's neighbourhood [pixels], odd, at most 999; the paper's by default."""
     neighbours: int | None = 1024
     """Most samples of a neighbourhood, drawn with a Gaussian; time and memory grow with it. None: half of those in the
-    box, as in the paper, 12 100 for a box of 55 at 8 spp, for some fifteen times the time."""
+    box, as in the paper, 12 100 for a box of 55 at 8 spp, for some five times the time."""
     variance: float = 1.0
-    """Squared sigma of the weights at 8 spp; the paper has 0.02 for noisy scenes and 0.002 for others."""
+    """Squared sigma of the weights at 8 spp; the paper has 0.02 for noisy scenes and 0.002 for others, with
+    which much noise stays where clamped light is given back."""
     reinsert: bool = True
     """Give clamped light back within its pixel (Lehtinen et al. 2012), and what the weights lose or gain over the whole
     picture back by one factor a channel, so that the mean stays that of the input."""
