@@ -10,6 +10,8 @@ from warpgi.load import load_scene
 from warpgi.materials import Conductor, Dielectric, Diffuse, Emissive, Mirror, Texture
 from warpgi.methods import METHODS, AmbientOcclusion, LightField, PathTracing, Sampler
 from warpgi.metrics import compare
+from warpgi.mitsuba_samples import sample_from_mitsuba
+from warpgi.mitsuba_scene import to_mitsuba
 from warpgi.progress import Progress
 from warpgi.reconstruct import reconstruct
 from warpgi.render import Interrupted, render, versions
@@ -47,6 +49,8 @@ __all__ = [
     "reconstruct",
     "render",
     "sample",
+    "sample_from_mitsuba",
     "scenes",
+    "to_mitsuba",
     "versions",
 ]
