@@ -67,10 +67,9 @@ class OidnPeer:
         with self.oidn.Device(self.oidn.OIDN_DEVICE_TYPE_CPU) as device:
             device.set_int("numThreads", self.threads)
             device.commit()
-            stages = [
-                self._filter(device, {name: images[name]}, name) for name in ("albedo", "normal") if self.prefilter
-            ]
-            clean = images | {name: output for name, (_, output) in zip(("albedo", "normal"), stages, strict=False)}
+            guides = ("albedo", "normal") if self.prefilter else ()
+            stages = [self._filter(device, {name: images[name]}, name) for name in guides]
+            clean = images | {name: output for name, (_, output) in zip(guides, stages, strict=True)}
             stages.append(self._filter(device, clean, "color"))
             ready = time.perf_counter()
             for stage, _ in stages:

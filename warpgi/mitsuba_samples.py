@@ -88,9 +88,7 @@ def sample_from_mitsuba(
     """
     mi = require_mitsuba()
     if mi.variant().startswith("scalar"):
-        raise ValueError(
-            f"mitsuba's variant is {mi.variant()}, expected one that traces many rays at once: llvm_ad_rgb"
-        )
+        raise ValueError(f"mitsuba's variant is {mi.variant()}, expected a vectorised one, such as llvm_ad_rgb")
     if not isinstance(mi_scene, mi.Scene):
         raise TypeError(f"mi_scene is {type(mi_scene).__name__}, expected a mitsuba.Scene of {mi.variant()}")
     spp, size, seed = checks.count("spp", spp), checks.image_size(size), checks.count("seed", seed, 0)
@@ -106,7 +104,7 @@ def sample_from_mitsuba(
     bands = [range(y, min(y + step, size[1])) for y in range(0, size[1], step)]
     with _film_size(mi, camera, size):
         parts = [tracer.trace(rows, seed, recursive) for rows in bands]
-    arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    arrays: dict[str, Any] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     return SampleBuffer(size[0], size[1], spp, **arrays)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from warpgi import checks
 from warpgi.camera import Camera
 from warpgi.lights import DistantLight, Environment, Light, PointLight
-from warpgi.materials import Colour, Conductor, Dielectric, Diffuse, Material, Mirror, Texture
+from warpgi.materials import Colour, Conductor, Dielectric, Diffuse, Material, Texture
 from warpgi.mitsuba_plugins import SPOT, SURFACE, register
 from warpgi.scene import Scene, Shape
 
@@ -170,13 +170,13 @@ class _Exporter:
             return {"type": "dielectric", "int_ior": material.ior, "ext_ior": 1.0}
         if isinstance(material, Conductor):
             return self._metal(material) if self.exact else {"type": "twosided", "bsdf": self._nearly_metal(material)}
-        kind, colour = (
-            ("diffuse", material.albedo) if isinstance(material, Diffuse) else ("mirror", material.reflectance)
-        )
+        is_diffuse = isinstance(material, Diffuse)
+        colour = material.albedo if isinstance(material, Diffuse) else material.reflectance
         if smooth and self.exact:
+            kind = "diffuse" if is_diffuse else "mirror"
             return {"type": SURFACE, "kind": kind, "reflectance": self._texture(colour)}
         own = {"type": "diffuse", "reflectance": self._texture(colour)}
-        if kind == "mirror":
+        if not is_diffuse:
             own = {"type": "conductor", "material": "none", "specular_reflectance": self._texture(colour)}
         return {"type": "twosided", "bsdf": own}
 
@@ -194,10 +194,10 @@ class _Exporter:
         if metal.eta is not None:
             return result | {"eta": rgb(metal.eta), "k": rgb(metal.k)}
         # eta 1 and such a k reflect this much at normal incidence (Pharr, Jakob, Humphreys 2023, sec. 9.4)
-        textured = isinstance(metal.reflectance, Texture)
-        colour = np.minimum(metal.reflectance.pixels if textured else metal.reflectance, 0.9999)
+        texture = metal.reflectance if isinstance(metal.reflectance, Texture) else None
+        colour = np.minimum(np.asarray(metal.reflectance if texture is None else texture.pixels), 0.9999)
         k = 2.0 * np.sqrt(colour / (1.0 - colour))
-        return result | {"eta": rgb((1.0, 1.0, 1.0)), "k": self._bitmap(k) if textured else rgb(k)}
+        return result | {"eta": rgb((1.0, 1.0, 1.0)), "k": rgb(k) if texture is None else self._bitmap(k)}
 
     def _texture(self, colour: Colour | Texture) -> Any:
         if not isinstance(colour, Texture):
@@ -216,8 +216,7 @@ def _sensor(mi: Any, scene: Scene, size: tuple[int, int]) -> dict[str, Any]:
     camera: Camera = scene.camera
     origin, target, up = (list(v) for v in (camera.position, camera.target, camera.up))
     low, high = scene.bounds()
-    far = np.linalg.norm(np.maximum(np.abs(low - origin), np.abs(high - origin)))
-    far = REACH * float(far)
+    far = REACH * float(np.linalg.norm(np.maximum(np.abs(low - origin), np.abs(high - origin))))
     result = {
         "type": "perspective",
         "fov": camera.fov,
