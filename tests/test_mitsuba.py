@@ -87,10 +87,10 @@ def quad(corner, u, v, material=GREY, **fields):
     return gi.Shape(vertices, [(0, 1, 2), (0, 2, 3)], material, uv=uv * (1.6, 1.3) + (0.3, -0.4), **fields)
 
 
-def ball(material, smooth=True, **fields):
+def ball(material, smooth=True, levels=2, **fields):
     from warpgi.scenes.primitives import icosphere
 
-    mesh = icosphere(0.5, 2).move((0.0, 0.55, 0.0))
+    mesh = icosphere(0.5, levels).move((0.0, 0.55, 0.0))
     uv = np.stack([2.0 * mesh.normals[:, 0], mesh.normals[:, 1]], axis=1)
     normals = mesh.normals if smooth else None
     return gi.Shape(mesh.vertices, mesh.faces, material, normals=normals, uv=uv, name="ball", **fields)
@@ -110,6 +110,13 @@ def stripes():
     return gi.Texture(pixels)
 
 
+def leaf():
+    """A square whose shading normals lean far over, each its own way, with the sun behind it."""
+    flat = quad((-0.6, 0.2, 0.3), (1.2, 0.0, 0.1), (0.0, 1.0, -0.2))
+    normals = [(-1.0, -0.8, 0.4), (1.0, -1.0, 0.3), (0.9, 1.2, 0.5), (-1.2, 0.9, 0.3)]
+    return gi.Shape(flat.vertices, flat.faces, gi.Diffuse((0.7, 0.8, 0.6)), normals=normals)
+
+
 LAMP = {"corner": (-0.6, 0.5, 0.6), "u": (0.4, 0.7, 0.0), "v": (0.3, 0.0, -0.5)}
 STAGES = {
     "texture": stage(lights=[SKY], floor=gi.Diffuse(stripes())),
@@ -118,14 +125,17 @@ STAGES = {
     "parallel light": stage(ball(GREY), lights=[SUN]),
     "lamp": stage(quad(**LAMP, emission=gi.Emissive((5.0, 4.0, 3.0)))),
     "lamp of two sides": stage(quad(**LAMP, emission=gi.Emissive((5.0, 4.0, 3.0), two_sided=True))),
-    "round lamp": stage(ball(gi.Diffuse(0.0), emission=gi.Emissive((2.0, 3.0, 4.0)))),
+    "round lamp": stage(ball(gi.Diffuse(0.0), levels=0, emission=gi.Emissive((2.0, 3.0, 4.0)))),
     "mirror": stage(ball(gi.Mirror(stripes())), lights=[SUN, SKY]),
     "flat mirror": stage(ball(gi.Mirror(stripes()), smooth=False), lights=[SUN, SKY]),
     "glass": stage(ball(gi.Dielectric(1.4), smooth=False), lights=[SUN, SKY]),
     "metal": stage(ball(gi.Conductor(0.1, stripes())), lights=[SUN, SKY]),
     "gold": stage(ball(gi.Conductor(0.03, eta=(0.14, 0.37, 1.44), k=(3.98, 2.38, 1.6))), lights=[SUN, SKY]),
+    "leaf": stage(leaf(), lights=[SKY, gi.DistantLight((-0.3, -1.0, 0.5), 5.0)]),
     "lens": stage(
-        ball(GREY), lights=[SKY], camera=gi.Camera(CAMERA.position, CAMERA.target, lens_radius=0.2, focus_distance=2.0)
+        quad(**LAMP, emission=gi.Emissive((5.0, 4.0, 3.0))),
+        floor=gi.Diffuse(stripes()),
+        camera=gi.Camera(CAMERA.position, CAMERA.target, lens_radius=0.15, focus_distance=2.0),
     ),
 }
 
@@ -175,9 +185,9 @@ def test_indirect_layers_agree(peers, request, variant):
 def test_passes_of_a_wavefront_make_one_picture(llvm, peers, monkeypatch):
     """What does not fit into one wavefront is rendered in several, of independent samples."""
     peer = peers.MitsubaPeer(STAGES["texture"], (16, 16), 3, 2, peers.LLVM)
-    whole = picture([peer.render(6, seed) for seed in range(RUNS)])
+    whole = picture([peer.render(8, seed) for seed in range(RUNS)])
     monkeypatch.setattr(peers, "WAVEFRONT", 4 * 16 * 16)
-    parts = picture([peer.render(6, seed + RUNS) for seed in range(RUNS)])
+    parts = picture([peer.render(8, seed + RUNS) for seed in range(RUNS)])
     assert_agree(whole, parts)
     ratio = parts.layers["variance"].sum() / whole.layers["variance"].sum()
     # of two variances, 256 pixels of RUNS - 1 degrees of freedom each
@@ -240,15 +250,20 @@ def test_mitsubas_cornell_box_is_reconstructed(llvm, reference):
 
 def test_a_buffer_depends_on_its_seed_alone(llvm, monkeypatch):
     """The same seed, the same samples; another, others; and bands of rows draw numbers of their own."""
-    scene = box(llvm, (16, 16))
+    paint = {"type": "twosided", "bsdf": {"type": "diffuse"}}
+    scene = room(llvm, plate(llvm, paint))
     first, again, other = (gi.sample_from_mitsuba(scene, 2, (16, 16), seed) for seed in (3, 3, 4))
-    np.testing.assert_array_equal(first.radiance, again.radiance)
+    np.testing.assert_array_equal(first.origin, again.origin)
+    np.testing.assert_array_equal(first.hit, again.hit)
     assert (first.hit != other.hit).any()
     monkeypatch.setattr(mitsuba_samples, "WAVEFRONT", 2 * 16 * 4)
     bands = gi.sample_from_mitsuba(scene, 2, (16, 16), 3)
     assert len(bands) == len(first)
-    radiance = bands.radiance.reshape(4, -1)
-    assert all((radiance[0] != radiance[band]).any() for band in range(1, 4))
+    # of the plane that they see, places within pixels: the same would be the same distance apart everywhere
+    places = bands.origin.reshape(4, -1, 3)
+    pixel = np.ptp(bands.origin[:, 0]) / 16
+    for band in range(1, 4):
+        assert np.std(places[band] - places[0], axis=0).max() > 0.1 * pixel
 
 
 def test_the_scene_keeps_its_film(llvm):
