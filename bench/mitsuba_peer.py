@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from warpgi import Scene, to_mitsuba
+from warpgi.mitsuba_scene import needs_plugins
 
 SCALAR, LLVM = VARIANTS = ("scalar_rgb", "llvm_ad_rgb")
 
@@ -74,7 +75,7 @@ class MitsubaPeer:
         compile_seconds: time in which all pictures so far compiled kernels; 0 in a scalar variant, and near 0 where
             Dr.Jit finds them in its cache on disk.
         version: Mitsuba's.
-        exact: whether it renders our materials exactly; else close ones of its own (`gi.to_mitsuba`).
+        exact: whether it renders our scene exactly; else materials are close ones of its own (`gi.to_mitsuba`).
 
     Args:
         scene: what to render.
@@ -105,9 +106,10 @@ class MitsubaPeer:
 
         self.drjit, self.variant, self.threads = drjit, variant, threads
         self.version: str = self.mitsuba.__version__
-        self.exact = variant != SCALAR if exact is None else exact
+        exact = variant != SCALAR if exact is None else exact
+        self.exact = exact or not needs_plugins(scene)
         self.pixels = size[0] * size[1]
-        description = to_mitsuba(scene, size, max_depth, roulette_depth, self.exact)
+        description = to_mitsuba(scene, size, max_depth, roulette_depth, exact)
         path = description["integrator"]
         self.scene = self.mitsuba.load_dict(description)
         self.path = self.scene.integrator()

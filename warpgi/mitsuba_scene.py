@@ -9,7 +9,7 @@ import numpy as np
 
 from warpgi import checks
 from warpgi.camera import Camera
-from warpgi.lights import DistantLight, Environment, Light, PointLight
+from warpgi.lights import DistantLight, Environment, Light, PointLight, SpotLight
 from warpgi.materials import Colour, Conductor, Dielectric, Diffuse, Material, Texture
 from warpgi.mitsuba_plugins import SPOT, SURFACE, register
 from warpgi.scene import Scene, Shape
@@ -86,6 +86,13 @@ def to_mitsuba(
     return result
 
 
+def needs_plugins(scene: Scene) -> bool:
+    """Whether anything in it is exact in Mitsuba by plugins of ours alone."""
+    smooth = (s.normals is not None and s.emission is None for s in scene.shapes if not _is_glass(s))
+    metal = (isinstance(shape.material, Conductor) for shape in scene.shapes)
+    return any(smooth) or any(metal) or any(isinstance(light, SpotLight) for light in scene.lights)
+
+
 def require_mitsuba() -> Any:
     """The mitsuba module, with an RGB variant set.
 
@@ -123,7 +130,7 @@ class _Exporter:
             return {"": self._mesh(shape, shape.vertices, shape.faces, None)}
         if not shape.emission.two_sided:
             return {"": self._mesh(shape, shape.vertices, shape.faces, shape.emission.radiance)}
-        if isinstance(shape.material, Dielectric):
+        if _is_glass(shape):
             raise NoCounterpart(f"{shape.name} is glass that emits on both sides, which Mitsuba has no counterpart for")
         # triangles of their own, so that each moves along its own normal
         corners = shape.vertices[shape.faces]
@@ -210,6 +217,10 @@ class _Exporter:
     def _bitmap(self, pixels: np.ndarray) -> Any:
         bitmap = {"type": "bitmap", "bitmap": self.mi.Bitmap(pixels.astype(np.float32)), "raw": True}
         return self.mi.load_dict(bitmap | {"filter_type": "bilinear", "wrap_mode": "repeat"})
+
+
+def _is_glass(shape: Shape) -> bool:
+    return isinstance(shape.material, Dielectric)
 
 
 def _sensor(mi: Any, scene: Scene, size: tuple[int, int]) -> dict[str, Any]:
