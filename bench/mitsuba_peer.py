@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
 from collections.abc import Callable
 from functools import cache
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -23,14 +25,11 @@ SEED_STEP = 16
 # Paths that a vectorised variant traces in one go.
 WAVEFRONT = 1 << 22
 
-# Compiles a kernel with a ray in it, which versions of LLVM that are too old abort at.
+# Versions of LLVM that are too old abort where they compile a path tracer.
 TRIAL = """
-import drjit, mitsuba
+import mitsuba
 mitsuba.set_variant("llvm_ad_rgb")
-scene = mitsuba.load_dict({"type": "scene", "shape": {"type": "sphere"}, "integrator": {"type": "path"}})
-ray = mitsuba.Ray3f(mitsuba.Point3f(0, 0, drjit.linspace(mitsuba.Float, 3, 4, 64)), mitsuba.Vector3f(0, 0, -1))
-drjit.eval(scene.ray_intersect(ray).p)
-drjit.sync_thread()
+mitsuba.render(mitsuba.load_dict(mitsuba.cornell_box()), spp=1, sensor=0).numpy()
 """
 
 
@@ -41,7 +40,10 @@ class MissingPeer(ValueError):
 @cache
 def llvm_fault() -> str | None:
     """Why `llvm_ad_rgb` does not run here, None if it does; tried in a process of its own, as it may abort."""
-    done = subprocess.run([sys.executable, "-c", TRIAL], capture_output=True, text=True, timeout=120)
+    with TemporaryDirectory(prefix="warpgi-mitsuba-") as folder:
+        # a home where Dr.Jit finds no kernels that another LLVM compiled, and Python what it finds here
+        home = os.environ | {"HOME": folder, "LOCALAPPDATA": folder, "PYTHONPATH": os.pathsep.join(sys.path)}
+        done = subprocess.run([sys.executable, "-c", TRIAL], capture_output=True, text=True, timeout=120, env=home)
     if done.returncode == 0:
         return None
     lines = [line for line in done.stderr.splitlines() if "LLVM" in line]

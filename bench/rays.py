@@ -17,6 +17,7 @@ import warp as wp
 import warpgi as gi
 from bench.compiling import compile_rows
 from bench.mitsuba_peer import MitsubaPeer
+from bench.photons import photon_rows
 from bench.reconstruction import AUTHORS, AUTHORS_YARDSTICK, SPP, stage_rows, yardstick
 from bench.report import Row, circumstances, paired_ratio, print_table, row, write_json
 from bench.turns import take_turns
@@ -216,6 +217,7 @@ def scene_rows(
         row(scene.name, "device memory, film", BYTES_PER_PIXEL * pixels, "B"),
         *ray_rows(Tracer(scene, on_device, device, settings.size, settings.spp), scene.name, settings.repeats),
         *path_rows(scene, on_device, settings, peer, note),
+        *photon_rows(scene, on_device, settings.size, settings.repeats, pixels * settings.spp),
     ]
 
 

@@ -12,7 +12,7 @@ wp.set_module_options({"enable_backward": False})
 
 MAX_NEIGHBOURS = 32  # the length of the arrays in NEAREST
 
-vec8 = wp.types.vector(length=8, dtype=wp.float32)
+vec9 = wp.types.vector(length=9, dtype=wp.float32)
 
 
 @wp.struct
@@ -24,36 +24,23 @@ class SplatTree:
     block_count: int
 
 
-# Squared distance to the k-th neighbour in the metric |d|^2 + stretch (d.n)^2, the sample itself counted, and in
-# Euclid's; samples at the very same place are not neighbours, or they would vanish.
-NEAREST = (
-    LANES_HEAD
-    + """
-    const int block0 = i / 8;
-    const float* q = tree.blocks.data + (size_t)block0 * 80 + i % 8;
-    const float cx = q[0], cy = q[8], cz = q[16], nx = q[24], ny = q[32], nz = q[40];
-    const int want = k - 1;
-    float metric[32], plain[32];
-    int found = 0;
-    float worst = 1.0e30f;
+# The search for what is nearest to (cx, cy, cz) in the metric |d|^2 + stretch (d.n)^2: every lane that ACCEPT takes and
+# that is nearer than `worst` is handed to KEEP, which lowers `worst`. `block0` is where to begin, -1: at the root. NODE
+# sees each node (`p`, and its `first` child) before its children.
+SEARCH_HEAD = """
     int stack[128];
     float entry[128];
-    int top = 0;
-    int current = -1 - block0;
-    // the three blocks around the sample first: they bound the search
-    int begin = block0 > 0 ? block0 - 1 : 0, end = block0 + 1 < tree.block_count ? block0 + 1 : block0;
+    stack[0] = 0;
+    entry[0] = 0.0f;
+    int top = 1;
+    // the three blocks around `block0` first: they bound the search
+    const int begin = block0 > 0 ? block0 - 1 : 0;
+    const int end = block0 < 0 ? -1 : (block0 + 1 < tree.block_count ? block0 + 1 : block0);
     int next = begin;
-    bool start = true;
     while (true) {
-        int block = -1;
-        if (start) {
+        int block = -1, current = 0;
+        if (next <= end) {
             block = next++;
-            if (next > end) {
-                start = false;
-                stack[0] = 0;
-                entry[0] = 0.0f;
-                top = 1;
-            }
         } else {
             if (top == 0)
                 break;
@@ -76,26 +63,20 @@ NEAREST = (
                 const float along = dx * nx + dy * ny + dz * nz;
                 d2[j] = dx * dx + dy * dy + dz * dz;
                 m2[j] = d2[j] + stretch * along * along;
-                met[j] = (int)((p[48 + j] >= 0.0f) & (d2[j] > 0.0f) & (m2[j] < worst));
+                met[j] = (int)((p[48 + j] >= 0.0f) & (d2[j] > 0.0f) & (m2[j] < worst)ACCEPT);
             }
             unsigned mask = lane_mask(met);
             while (mask) {
                 const int j = next_lane(mask);
                 if (m2[j] < worst) {
-                    int slot = found < want ? found++ : want - 1;
-                    while (slot > 0 && metric[slot - 1] > m2[j]) {
-                        metric[slot] = metric[slot - 1];
-                        plain[slot] = plain[slot - 1];
-                        --slot;
-                    }
-                    metric[slot] = m2[j];
-                    plain[slot] = d2[j];
-                    if (found == want)
-                        worst = metric[want - 1];
+"""
+SEARCH_TAIL = """
                 }
             }
         } else {
             const float* p = tree.nodes.data + (size_t)current * 48;
+            const int first = tree.first.data[current];
+            NODE
             float d2[8];
             int met[8];
             for (int j = 0; j < 8; ++j) {
@@ -105,7 +86,6 @@ NEAREST = (
                 d2[j] = dx * dx + dy * dy + dz * dz;
                 met[j] = (int)(d2[j] < worst);
             }
-            const int first = tree.first.data[current];
             const int base = top;
             unsigned mask = lane_mask(met);
             while (mask) {
@@ -121,8 +101,44 @@ NEAREST = (
             }
         }
     }
-    return found > 0 ? plain[found - 1] : -1.0f;
 """
+
+
+def search(keep: str, accept: str = "", node: str = "") -> str:
+    """Native code of the search: what to do with a lane, a further test of lanes, and what to do at a node."""
+    return SEARCH_HEAD.replace("ACCEPT", accept) + keep + SEARCH_TAIL.replace("NODE", node)
+
+
+# Squared distance to the k-th neighbour in that metric, the sample itself counted, and in Euclid's; samples at the
+# very same place are not neighbours, or they would vanish, nor are those that face elsewhere: they are of another
+# surface, or of the other side of something thin.
+NEAREST = (
+    LANES_HEAD
+    + """
+    const int block0 = i / 8;
+    const float* q = tree.blocks.data + (size_t)block0 * 80 + i % 8;
+    const float cx = q[0], cy = q[8], cz = q[16], nx = q[24], ny = q[32], nz = q[40];
+    const int want = k - 1;
+    float metric[32], plain[32];
+    int found = 0;
+    float worst = 1.0e30f;
+"""
+    + search(
+        """
+                    int slot = found < want ? found++ : want - 1;
+                    while (slot > 0 && metric[slot - 1] > m2[j]) {
+                        metric[slot] = metric[slot - 1];
+                        plain[slot] = plain[slot - 1];
+                        --slot;
+                    }
+                    metric[slot] = m2[j];
+                    plain[slot] = d2[j];
+                    if (found == want)
+                        worst = metric[want - 1];
+""",
+        accept=" & (p[24 + j] * nx + p[32 + j] * ny + p[40 + j] * nz > 0.1f)",
+    )
+    + "    return found > 0 ? plain[found - 1] : -1.0f;\n"
 )
 
 
@@ -243,8 +259,9 @@ def shrink_crossed(
 # conflicts where its event line meets the st plane in the positive, or in the negative, half-spaces of both (with the
 # authors' erratum); that is a b depth_i depth_j > 0 for a = (h_j - h_i).n_i and b = (h_j - h_i).n_j.
 # `keep_one` and `keep_two` are squared parts of their radius that splats keep which are alone, or two, in the surface.
-# Returns radiance times weight (3), weight, weight of splats nearer than `reach`, splats in the surface, and whether
-# the gather was cut short and how many undersampled surfaces were passed through.
+# Returns radiance times weight (3), weight, weight of splats nearer than `reach`, splats in the surface, whether
+# the gather was cut short, how many undersampled surfaces were passed through, and the distance of a surface whose
+# splats all face away, else 0.
 SURFACE = (
     WALK_HEAD
     + """
@@ -388,9 +405,16 @@ SURFACE = (
             within += t_of[j] < reach ? w : 0.0f;
         }
     }
-    wp::vec_t<8, wp::float32> result;
+    float seen_behind = 0.0f;
+    if (!any_front && inside > 0) {
+        seen_behind = 1.0e30f;
+        for (int j = 0; j < size; ++j)
+            seen_behind = smaller(seen_behind, t_of[j]);
+    }
+    wp::vec_t<9, wp::float32> result;
     result[0] = r; result[1] = g; result[2] = b; result[3] = weight; result[4] = within;
     result[5] = (float)inside; result[6] = (float)cut; result[7] = (float)surfaces_passed;
+    result[8] = seen_behind;
     return result;
 """
 )
@@ -399,4 +423,34 @@ SURFACE = (
 @wp.func_native(SURFACE)
 def first_surface(
     tree: SplatTree, o: wp.vec3, d: wp.vec3, noise: float, reach: float, keep_one: float, keep_two: float
-) -> vec8: ...
+) -> vec9: ...
+
+
+# The splat nearest to x among those that face a ray along d; -1 if none does.
+NEAREST_FACING = (
+    LANES_HEAD
+    + """
+    const int block0 = -1;
+    const float cx = x[0], cy = x[1], cz = x[2], nx = 0.0f, ny = 0.0f, nz = 0.0f, stretch = 0.0f;
+    float worst = 1.0e30f;
+    int nearest = -1;
+"""
+    + search(
+        """
+                    worst = m2[j];
+                    nearest = block * 8 + j;
+""",
+        accept=" & (p[24 + j] * d[0] + p[32 + j] * d[1] + p[40 + j] * d[2] < 0.0f)",
+    )
+    + "    return nearest;\n"
+)
+
+
+@wp.func_native(NEAREST_FACING)
+def nearest_facing(tree: SplatTree, x: wp.vec3, d: wp.vec3) -> int: ...
+
+
+@wp.func
+def splat_radiance(tree: SplatTree, splat: int):
+    at = (splat // 8) * 80 + splat % 8 + 56
+    return wp.vec3(tree.blocks[at], tree.blocks[at + 8], tree.blocks[at + 16])

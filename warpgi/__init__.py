@@ -8,7 +8,7 @@ from warpgi.device import Device
 from warpgi.lights import DistantLight, Environment, PointLight, SpotLight
 from warpgi.load import load_scene
 from warpgi.materials import Conductor, Dielectric, Diffuse, Emissive, Mirror, Texture
-from warpgi.methods import METHODS, AmbientOcclusion, LightField, PathTracing, Sampler
+from warpgi.methods import METHODS, AmbientOcclusion, Kernel, LightField, PathTracing, PhotonMap, Sampler
 from warpgi.metrics import compare
 from warpgi.mitsuba_samples import sample_from_mitsuba
 from warpgi.mitsuba_scene import to_mitsuba
@@ -32,9 +32,11 @@ __all__ = [
     "Emissive",
     "Environment",
     "Interrupted",
+    "Kernel",
     "LightField",
     "Mirror",
     "PathTracing",
+    "PhotonMap",
     "PointLight",
     "Progress",
     "Render",

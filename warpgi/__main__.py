@@ -28,6 +28,8 @@ WRONG = {
     "zero_length": "samples had no length and were dropped",
     "bad_normal": "samples had no normal and were dropped",
     "degenerate_triangles": "triangles without area were dropped",
+    "fireflies": "pixels are far brighter than all around: light that paths hardly find",
+    "nonfinite_photons": "photons were not finite and were dropped",
     "missing_support": "reconstruction rays found no sample and were left out",
     "cut_gathers": "reconstruction rays met more samples than were looked at",
 }
@@ -61,6 +63,12 @@ class RenderCommand:
     """Where the picture goes: .exr with all layers, .png tone-mapped; may be given more than once."""
     exposure: float = 0.0
     """Stops by which a .png is brightened."""
+    seconds: float | None = None
+    """Time after which the picture is taken as it is."""
+    error: float | None = None
+    """relMSE, by the samples' variance, below which it is good enough."""
+    checkpoint: Path | None = None
+    """Where the unfinished picture is kept, and from which it goes on if it is there."""
     device: str | None = None
     """cpu, cuda:0, ...; a GPU if there is one."""
     threads: int | None = None
@@ -70,10 +78,11 @@ class RenderCommand:
 
     def run(self) -> None:
         device = _prepare(self.out, self.device, self.threads, self.memory_limit)
-        scene = _open_scene(self.scene)
+        scene = open_scene(self.scene)
 
         def work() -> gi.Render:
-            return gi.render(scene, self.method, self.size, self.seed, device, progress=sys.stderr.isatty())
+            ends: dict[str, Any] = {"seconds": self.seconds, "error": self.error, "checkpoint": self.checkpoint}
+            return gi.render(scene, self.method, self.size, self.seed, device, sys.stderr.isatty(), **ends)
 
         _make(work, self.out, self.exposure)
 
@@ -233,7 +242,7 @@ def _keep(picture: gi.Render, out: tuple[Path, ...], exposure: float) -> None:
         print(f"wrote {path}")
 
 
-def _open_scene(text: str) -> gi.Scene:
+def open_scene(text: str) -> gi.Scene:
     """A file where there is one or the name looks like one, else a built-in scene with its parameters."""
     if Path(text).suffix.lower() in SUFFIXES or Path(text).exists():
         return gi.load_scene(text)

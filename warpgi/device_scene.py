@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+
 import numpy as np
 import warp as wp
 
@@ -32,6 +34,7 @@ class DeviceScene:
     Attributes:
         struct: the `kernels.scene.Scene` argument of kernels.
         centre: float64 world position of the device's origin, shape (3,).
+        power: radiant flux of all lights but the environment, mean over the channels [W], as light sampling knows it.
         nbytes: bytes of all arrays on the device.
     """
 
@@ -62,6 +65,14 @@ class DeviceScene:
         result.focus_distance = camera.focus_distance or distance
         result.width, result.height = size
         return result
+
+    def fingerprint(self) -> str:
+        """SHA-256 of everything that a picture depends on."""
+        digest = hashlib.sha256(repr((self.scene.camera, self.centre.tolist())).encode())
+        digest.update(repr(self.struct.environment).encode())
+        for array in self._arrays:
+            digest.update(array.numpy().tobytes())
+        return digest.hexdigest()
 
     def _upload(self, values: np.ndarray, dtype: object) -> wp.array:
         array = self.device.array(values, dtype)
@@ -139,7 +150,8 @@ class DeviceScene:
         powers = [part * factor for part, factor in zip(powers, raise_by, strict=True)]
         density = {i: value * factor for (i, value), factor in zip(density.items(), raise_by, strict=False)}
         power = np.concatenate(powers) if powers else np.zeros(0)
-        total = float(power.sum()) or 1.0
+        self.power = float(power.sum())
+        total = self.power or 1.0
         struct = self.struct
         struct.environment = wp.vec3(*environment)
         struct.light_count = len(power)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import warp as wp
 
 from warpgi.device import Device
 from warpgi.kernels.film import Film as FilmStruct
+from warpgi.metrics import RELMSE_EPSILON, RELMSE_MEAN
 
 # Per-pixel arrays of the device's struct and their types.
 FIELDS = {
@@ -88,6 +91,27 @@ class Film:
         if self._struct is None:
             return np.zeros(self._shape(FIELDS[name]), _numpy(FIELDS[name]))
         return getattr(self._struct, name).numpy()
+
+    def restore(self, fields: dict[str, np.ndarray]) -> None:
+        """Takes the values of all pixels, as `field` gave them."""
+        for name, dtype in FIELDS.items():
+            values: np.ndarray = fields[name].astype(_numpy(dtype)).reshape(self._shape(dtype))
+            if self._host:
+                self._host[name][:] = values
+            else:
+                getattr(self.load(self.bands[0]), name).assign(values)
+
+    def relative_variance(self) -> float:
+        """Mean over pixels and channels of variance / (mean^2 + 0.01), scaled to a mean of 0.5: the part of relMSE
+        that is noise, as the picture itself knows it; infinite before every pixel has two samples."""
+        count = self.field("count")[:, None].astype(np.float64)
+        if count.min(initial=2) < 2:
+            return math.inf
+        mean = sum(self.field(name).astype(np.float64) for name in ("emission", "direct", "indirect"))
+        variance = self.field("squares") / (count * (count - 1.0))
+        total = float(np.mean(mean))
+        scale = RELMSE_MEAN / total if total > 0.0 else 1.0
+        return float(np.mean(scale**2 * variance / (np.square(scale * mean) + RELMSE_EPSILON)))
 
     def spp(self) -> int:
         """Samples that every pixel holds at least, dropped ones included."""

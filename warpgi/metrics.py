@@ -14,6 +14,12 @@ from warpgi.image import encode_srgb
 RELMSE_EPSILON = 0.01
 RELMSE_MEAN = 0.5
 
+# A firefly is so many times as bright as its second brightest neighbour and this part of the picture's mean.
+FIREFLY_RATIO = 4.0
+FIREFLY_MEAN = 0.25
+# And its standard error is this part of its brightness: it comes from few of its samples.
+FIREFLY_ERROR = 0.25
+
 
 def compare(image: Any, reference: Any) -> dict[str, float | None]:
     """Errors of a picture against a reference, each 0 where they are equal but for PSNR, which is infinite.
@@ -54,6 +60,29 @@ def compare(image: Any, reference: Any) -> dict[str, float | None]:
         "psnr": -10.0 * math.log10(shown_mse) if shown_mse > 0.0 else math.inf,
         "flip": _flip(shown, shown_ref),
     }
+
+
+def count_fireflies(image: np.ndarray, variance: np.ndarray) -> int:
+    """Pixels that owe their light to one or two of many samples: what a path tracer hardly finds is there, but seldom.
+
+    Such a pixel is 4 times as bright, in its brightest channel, as its second brightest neighbour and a quarter of the
+    picture's mean together, and its standard error is a quarter of its brightness or more. With one sample per pixel,
+    whose variance nobody knows, brightness alone decides.
+
+    Args:
+        image: radiance, shape (H, W, 3); a layer without lamps, which are meant to be bright.
+        variance: of each pixel, the same shape; all 0: unknown.
+    """
+    value = image.max(axis=2).astype(np.float64)
+    height, width = value.shape
+    padded = np.pad(value, 1, constant_values=0.0)
+    shifts = [(y, x) for y in range(3) for x in range(3) if (y, x) != (1, 1)]
+    around = np.stack([padded[y : y + height, x : x + width] for y, x in shifts])
+    second = np.partition(around, -2, axis=0)[-2]
+    bright = value > FIREFLY_RATIO * (second + FIREFLY_MEAN * value.mean())
+    if variance.any():
+        bright &= np.sqrt(variance.max(axis=2)) > FIREFLY_ERROR * value
+    return int(np.count_nonzero(bright))
 
 
 def _radiance(name: str, value: Any) -> np.ndarray:

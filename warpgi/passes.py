@@ -30,6 +30,7 @@ class Passes:
         report: Callable[[Progress], None] | None,
         counts: Callable[[], dict[str, int]],
         seconds: float = PASS_SECONDS,
+        between: Callable[[float], bool] | None = None,
     ) -> None:
         """Calls step(first, count) until `total` units are done, each call about `seconds` long.
 
@@ -41,6 +42,7 @@ class Passes:
             report: gets a `Progress` after each step; None: nobody listens.
             counts: rays so far, for the report.
             seconds: a step's length to aim at.
+            between: called after each step with the seconds since the first; True ends the work early.
         """
         started = time.perf_counter()
         count = 1
@@ -54,6 +56,8 @@ class Passes:
             took = time.perf_counter() - begin
             if report is not None:
                 report(Progress(self.done, self.total, self.unit, time.perf_counter() - started, counts()))
+            if between is not None and between(time.perf_counter() - started):
+                return
             count = max(1, min(4 * count, int(count * seconds / max(took, 1e-6))))
 
 

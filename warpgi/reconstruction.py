@@ -93,6 +93,7 @@ class Reconstruction:
             raise ValueError(f"memory_limit is {device.memory_limit} bytes, expected {need} for {len(samples)} samples")
         self.samples, self.device, self.seed = samples, device, seed
         self.reach = min(float(reach), 1e30)
+        self.caustics: wp.array | None = None  # of the primary hits, where they come from elsewhere
         state = samples.checked
         splats = np.flatnonzero(state.is_splat).astype(np.int32)
         self._upload(splats, hits)

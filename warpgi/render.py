@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import platform
+import time
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,11 +15,13 @@ import warp as wp
 
 import warpgi
 from warpgi import checks
+from warpgi.checkpoint import SAVE_SECONDS, Checkpoint
 from warpgi.device import Device, as_device
 from warpgi.device_scene import DeviceScene
 from warpgi.film import Film
 from warpgi.job import Job
 from warpgi.methods import METHODS, Method, PathTracing
+from warpgi.metrics import count_fireflies
 from warpgi.passes import PASS_SECONDS, Passes
 from warpgi.progress import Progress, progress_bar
 from warpgi.result import PARTS, Render
@@ -44,6 +48,9 @@ def render(
     seed: int = 0,
     device: str | Device | None = None,
     progress: bool | Callable[[Progress], None] = False,
+    seconds: float | None = None,
+    error: float | None = None,
+    checkpoint: str | Path | None = None,
 ) -> Render:
     """Renders a scene.
 
@@ -56,6 +63,11 @@ def render(
         seed: which random numbers, 0 to 2^31 - 1.
         device: "cpu", "cuda:0", a `Device`, or None for a GPU if there is one.
         progress: True shows a bar on standard error; a function gets a `Progress` after every pass.
+        seconds: time after which the picture is taken as it is, above 0; looked at between passes.
+        error: relMSE below which the picture is good enough, above 0, as far as noise goes: estimated from the samples'
+            variance, which with several samples to a photon map is too small.
+        checkpoint: file in which the unfinished picture is kept, and from which it goes on if it is there; the result
+            equals that of one run bit for bit, and `spp` may have been raised.
 
     Returns:
         The layers, timings by stage and counts.
@@ -74,6 +86,7 @@ def render(
     _check(scene, method)
     size = checks.image_size(size)
     seed = checks.count("seed", seed, 0)
+    _check_end(method, seconds, error, checkpoint)
     where = as_device(device)
     if method.needs_light and not scene.has_light():
         warnings.warn("the scene has no light: the picture is black", stacklevel=2)
@@ -86,7 +99,30 @@ def render(
         film = Film(size, where, where.memory_limit - on_device.nbytes - method.device_bytes(size))
         job = Job(on_device, on_device.camera(size), size, seed, where)
     passes = Passes(*method.passes())
+    kept = None
+    if checkpoint is not None:
+        kept = Checkpoint(Path(checkpoint), method, job)
+        kept.restore(film)
+        passes.done = kept.done
     interrupted = False
+
+    def counts_so_far() -> dict[str, int]:
+        counts = method.counts(state)
+        before = kept.counts if kept else {}
+        return film.counts() | {name: count + before.get(name, 0) for name, count in counts.items()}
+
+    saved = time.perf_counter()
+
+    def between(elapsed: float) -> bool:
+        nonlocal saved
+        if kept is not None and time.perf_counter() - saved >= SAVE_SECONDS:
+            kept.save(film, passes.done, counts_so_far())
+            saved = time.perf_counter()
+        if seconds is not None and elapsed >= seconds:
+            return True
+        return error is not None and film.relative_variance() <= error
+
+    state: Any = None
     try:
         with timings.stage("prepare"):
             state = method.prepare(job, film)
@@ -96,19 +132,24 @@ def render(
                 lambda first, count: method.estimate(job, state, film, first, count),
                 where,
                 report,
-                lambda: film.counts() | method.counts(state),
+                counts_so_far,
                 PASS_SECONDS if len(film.bands) == 1 else BAND_SECONDS,
+                between,
             )
     except KeyboardInterrupt:
-        if passes.done == 0:
+        if passes.done == 0 or state is None:
             raise Interrupted(None, passes) from None
         interrupted = True
     with timings.stage("image"):
+        if kept is not None:
+            kept.save(film, passes.done, counts_so_far())
         special = method.finish(job, state, film)
         layers = film.layers(on_device.centre) | special
         if "image" in special:
             layers = {name: layer for name, layer in layers.items() if name not in (*PARTS, "variance")}
-        counts = film.counts() | method.counts(state) | {"degenerate_triangles": scene.degenerate_count}
+        counts = counts_so_far() | {"degenerate_triangles": scene.degenerate_count}
+        if "indirect" in layers:
+            counts["fireflies"] = count_fireflies(layers["indirect"], layers["variance"])
         result = Render(
             layers=layers,
             timings=dict(timings),
@@ -142,6 +183,18 @@ def versions() -> dict[str, str]:
         "numpy": np.__version__,
         "python": platform.python_version(),
     }
+
+
+def _check_end(method: Method, seconds: float | None, error: float | None, checkpoint: str | Path | None) -> None:
+    if seconds is not None:
+        checks.number("seconds", seconds, 0.0, open_lower=True)
+    if error is not None:
+        checks.number("error", error, 0.0, open_lower=True)
+    if checkpoint is not None and not isinstance(checkpoint, (str, Path)):
+        raise TypeError(f"checkpoint is {type(checkpoint).__name__}, expected a path")
+    for name, value in (("error", error), ("checkpoint", checkpoint)):
+        if value is not None and not getattr(method, "keeps_all_in_film", False):
+            raise ValueError(f"{name} is given, expected None: {type(method).__name__} keeps more than its film")
 
 
 def _check(scene: Scene, method: Method) -> None:

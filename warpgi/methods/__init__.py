@@ -10,6 +10,7 @@ from warpgi.job import Job
 from warpgi.methods.ambient_occlusion import AmbientOcclusion
 from warpgi.methods.light_field import LightField
 from warpgi.methods.path import PathTracing, Sampler
+from warpgi.methods.photon_map import Kernel, PhotonMap
 
 
 class Method(Protocol):
@@ -51,6 +52,7 @@ METHODS: dict[str, type] = {
     "path": PathTracing,
     "light-field": LightField,
     "ambient-occlusion": AmbientOcclusion,
+    "photon-map": PhotonMap,
 }
 
-__all__ = ["METHODS", "AmbientOcclusion", "LightField", "Method", "PathTracing", "Sampler"]
+__all__ = ["METHODS", "AmbientOcclusion", "Kernel", "LightField", "Method", "PathTracing", "PhotonMap", "Sampler"]

@@ -15,6 +15,7 @@ from warpgi.kernels.light_field import add_reflected
 from warpgi.kernels.samples import trace_samples
 from warpgi.kernels.splats import MAX_NEIGHBOURS
 from warpgi.methods.path import NEVER, Sampler, check_paths
+from warpgi.methods.photon_map import PhotonMap, light_by_photons
 from warpgi.reconstruction import (
     BYTES_PER_HIT,
     BYTES_PER_SAMPLE,
@@ -60,6 +61,9 @@ class LightField:
     primary_hits: int | None = None
     """Primary hits per pixel at which light is gathered, `spp` or more; None is `spp`. More of them make smooth edges,
     textures and foliage, for the cost of a camera ray each."""
+    photons: int = 0
+    """Paths from the lights for a photon map that gives the radiance at secondary hits in place of traced paths: free
+    of noise but blurred, with caustics read at the primary hits; 0: none."""
     light_samples: int = 32
     """Shadow rays to lights per pixel, shared out over its primary hits, which make the direct light."""
     max_depth: int | None = None
@@ -78,6 +82,7 @@ class LightField:
         checks.number("lone_radius", self.lone_radius, 0.0, 1.0, open_lower=True)
         checks.count("recursive", self.recursive, 0)
         checks.count("recursive_rays", self.recursive_rays)
+        checks.count("photons", self.photons, 0)
         checks.count("light_samples", self.light_samples)
         if self.primary_hits is not None:
             checks.count("primary_hits", self.primary_hits, self.spp)
@@ -91,7 +96,7 @@ class LightField:
     @property
     def kernels(self) -> tuple[wp.Kernel, ...]:
         """What it launches."""
-        return (trace_samples, *KERNELS)
+        return (trace_samples, *KERNELS, *(PhotonMap().kernels if self.photons else ()))
 
     @property
     def preprocessing(self) -> Preprocessing:
@@ -110,7 +115,8 @@ class LightField:
     def device_bytes(self, size: tuple[int, int]) -> int:
         """Device memory it takes beside scene and film."""
         hit, ray = PRIMARY_BYTES + BYTES_PER_HIT, SECONDARY_BYTES + BYTES_PER_SAMPLE
-        return size[0] * size[1] * (self.hits * hit + self.spp * ray)
+        photons = PhotonMap(photons=self.photons).device_bytes(size) if self.photons else 0
+        return size[0] * size[1] * (self.hits * hit + self.spp * ray) + photons
 
     def prepare(self, job: Job, film: Film) -> Reconstruction:
         """Traces the input, with what is not reconstructed going to the film, and makes splats of it."""
@@ -125,7 +131,10 @@ class LightField:
             self.sampler,
             with_hit_light=self.recursive > 0,
         )
-        return self.reconstruction(samples, job.device, job.seed, hits)
+        caustics = light_by_photons(job, self.photons, samples, hits) if self.photons else None
+        state = self.reconstruction(samples, job.device, job.seed, hits)
+        state.caustics = caustics
+        return state
 
     def reconstruction(
         self, samples: SampleBuffer, device: Device, seed: int, hits: PrimaryHits | None = None
@@ -150,6 +159,8 @@ class LightField:
         reflected = state.reflected()
         for band in film.bands:
             job.device.launch(add_reflected, len(band), [film.load(band), reflected, self.hits])
+            if state.caustics is not None:
+                job.device.launch(add_reflected, len(band), [film.load(band), state.caustics, self.hits])
         return {}
 
     def layers(self, state: Reconstruction) -> dict[str, np.ndarray]:

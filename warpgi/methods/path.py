@@ -67,6 +67,11 @@ class PathTracing:
         check_paths(self.max_depth, self.roulette_depth, self.sampler)
 
     @property
+    def keeps_all_in_film(self) -> bool:
+        """Whether the film is all that a later pass needs of earlier ones."""
+        return True
+
+    @property
     def needs_light(self) -> bool:
         """Whether the picture of a scene without light is black."""
         return True

@@ -1,0 +1,317 @@
+"""Photons (Jensen 1996): light emitted by power, scattered with Russian roulette, written down where it lands."""
+
+import warp as wp
+
+from warpgi.kernels.bsdf import sample
+from warpgi.kernels.direct import facing_normal, reflects
+from warpgi.kernels.film import is_finite
+from warpgi.kernels.lights import light_probability, pick_light
+from warpgi.kernels.rng import Sampler, make_sampler, sample_2d
+from warpgi.kernels.sampling import (
+    PI,
+    make_frame,
+    square_to_cosine_hemisphere,
+    square_to_disc,
+    square_to_triangle,
+    to_world,
+)
+from warpgi.kernels.scene import DIELECTRIC, DIFFUSE, Scene, closest_hit, offset_origin, ray_offset, surface_at
+
+wp.set_module_options({"enable_backward": False})
+
+# How light came to a photon's place; S is any surface that is not diffuse.
+DIRECT = wp.constant(0)  # L D
+CAUSTIC = wp.constant(1)  # L S+ D
+INDIRECT = wp.constant(2)  # any other
+
+# Pairs of random numbers: cell and light, point on it, aim, side of it; then two for each scattering.
+EMISSION_PAIRS = wp.constant(4)
+SCATTER_PAIRS = wp.constant(2)
+
+# Light that loses nothing, such as between mirrors, ends some day: from here on it survives with this probability.
+LONG_PATH = wp.constant(24)
+LONG_SURVIVAL = wp.constant(0.9)
+
+# Cells of the aim's unit square, along an axis, and of the lights' running sum of power.
+AIM_CELLS = wp.constant(32)
+LIGHT_CELLS = wp.constant(8)
+
+
+@wp.struct
+class Emission:
+    """How photons leave the lights."""
+
+    seed: int
+    map: int  # number of the map, with a random sequence of its own
+    sampler: int  # INDEPENDENT or SOBOL
+    part: float  # of the light that a photon carries: 1 / number of paths
+    radius: float  # of a sphere around the scene
+    environment: float  # probability that the environment emits
+    caustics: int  # 1: only what reaches a diffuse surface over others; a path ends there
+    aim_cdf: wp.array[float]  # running sum over cells of their probability; empty: all alike
+
+
+@wp.struct
+class Photons:
+    position: wp.array[wp.vec3]
+    normal: wp.array[wp.vec3]  # of the surface, on the side that the light came from
+    flux: wp.array[wp.vec3]  # [W]
+    kind: wp.array[int]  # DIRECT, CAUSTIC or INDIRECT
+
+
+@wp.struct
+class Beam:
+    o: wp.vec3
+    d: wp.vec3
+    flux: wp.vec3
+    cell: int
+
+
+@wp.func
+def pick_cell(cdf: wp.array[float], u: float):
+    low = int(0)
+    high = cdf.shape[0] - 1
+    while low < high:
+        middle = (low + high) // 2
+        if u < cdf[middle]:
+            high = middle
+        else:
+            low = middle + 1
+    return low
+
+
+@wp.func
+def square_to_sphere(u: wp.vec2):
+    z = 1.0 - 2.0 * u[0]
+    r = wp.sqrt(wp.max(0.0, 1.0 - z * z))
+    return wp.vec3(r * wp.cos(2.0 * PI * u[1]), r * wp.sin(2.0 * PI * u[1]), z)
+
+
+@wp.func
+def parallel_beam(d: wp.vec3, u: wp.vec2, radius: float):
+    """From a disc that covers the scene."""
+    disc = square_to_disc(u) * radius
+    frame = make_frame(d)
+    beam = Beam()
+    beam.o = frame.s * disc[0] + frame.t * disc[1] - d * (1.01 * radius)
+    beam.d = d
+    return beam
+
+
+@wp.func
+def emit(scene: Scene, emission: Emission, sampler: Sampler):
+    """A ray of light; its flux is that of the light over the density with which it was chosen.
+
+    Cells cut the space of `choice` (which light) and `aim`: what decides most about where light goes, the direction of
+    a lamp's and the place of parallel light (Jensen 1996's projection maps, for any light).
+    """
+    first = sample_2d(sampler, 0)
+    choice = first[0]
+    aim = sample_2d(sampler, 2)
+    weight = emission.part
+    cells = emission.aim_cdf.shape[0]
+    cell = int(0)
+    if cells > 0:
+        cell = pick_cell(emission.aim_cdf, first[0])
+        before = float(0.0)
+        if cell > 0:
+            before = emission.aim_cdf[cell - 1]
+        weight = weight / ((emission.aim_cdf[cell] - before) * float(cells))
+        aim = wp.vec2(
+            (float(cell % AIM_CELLS) + aim[0]) / float(AIM_CELLS),
+            (float((cell // AIM_CELLS) % AIM_CELLS) + aim[1]) / float(AIM_CELLS),
+        )
+        choice = (float(cell // (AIM_CELLS * AIM_CELLS)) + first[1]) / float(LIGHT_CELLS)
+    else:
+        x = wp.min(int(aim[0] * float(AIM_CELLS)), AIM_CELLS - 1)
+        y = wp.min(int(aim[1] * float(AIM_CELLS)), AIM_CELLS - 1)
+        z = wp.min(int(choice * float(LIGHT_CELLS)), LIGHT_CELLS - 1)
+        cell = (z * AIM_CELLS + y) * AIM_CELLS + x
+    u = sample_2d(sampler, 1)
+    beam = Beam()
+    if choice < emission.environment:
+        beam = parallel_beam(square_to_sphere(u), aim, emission.radius)
+        area = PI * emission.radius * emission.radius
+        beam.flux = scene.environment * (4.0 * PI * area * weight / emission.environment)
+        beam.cell = cell
+        return beam
+    weight = weight / (1.0 - emission.environment)
+    choice = wp.min((choice - emission.environment) / (1.0 - emission.environment), 0.99999994)
+    index = pick_light(scene, choice)
+    light = scene.lights[index]
+    if light.face >= 0:
+        a = scene.points[scene.indices[3 * light.face]]
+        b = scene.points[scene.indices[3 * light.face + 1]]
+        c = scene.points[scene.indices[3 * light.face + 2]]
+        bary = square_to_triangle(u)
+        shape = scene.shapes[scene.face_shapes[light.face]]
+        n = scene.face_normals[light.face]
+        sides = float(1.0)
+        if shape.two_sided != 0:
+            sides = 2.0
+            if sample_2d(sampler, 3)[0] < 0.5:
+                n = -n
+        beam.o = a * bary[0] + b * bary[1] + c * bary[2] + n * ray_offset(a, b, c)
+        beam.d = to_world(make_frame(n), square_to_cosine_hemisphere(aim))
+        beam.flux = shape.emission * (PI * sides * weight / shape.light_pdf)
+    elif light.distant != 0:
+        beam = parallel_beam(light.direction, aim, emission.radius)
+        area = PI * emission.radius * emission.radius
+        beam.flux = light.radiance * (area * weight / light_probability(scene, index))
+    else:
+        beam.o = light.position
+        solid_angle = 4.0 * PI
+        if light.cone_scale == 0.0:
+            beam.d = square_to_sphere(aim)
+        else:
+            # the intensity falls from the inner to the outer cone as the square of a line in the cosine
+            outer = -light.cone_offset / light.cone_scale
+            width = 1.0 / light.cone_scale
+            inner = outer + width
+            total = (1.0 - inner) + width / 3.0
+            v = aim[0] * total
+            cos_d = 1.0 - v
+            if v > 1.0 - inner:
+                cos_d = outer + width * wp.pow(wp.max(0.0, (total - v) * 3.0 / width), 1.0 / 3.0)
+            sin_d = wp.sqrt(wp.max(0.0, 1.0 - cos_d * cos_d))
+            phi = 2.0 * PI * aim[1]
+            beam.d = to_world(make_frame(light.direction), wp.vec3(sin_d * wp.cos(phi), sin_d * wp.sin(phi), cos_d))
+            solid_angle = 2.0 * PI * total
+        beam.flux = light.radiance * (solid_angle * weight / light_probability(scene, index))
+    beam.cell = cell
+    return beam
+
+
+@wp.struct
+class Track:
+    """What became of one path."""
+
+    stored: int  # photons
+    rays: int
+    dropped: int  # photons that were not finite
+    cell: int  # where its light was aimed
+
+
+@wp.func
+def trace_photons(scene: Scene, emission: Emission, path: int, photons: Photons, place: int, room: int):
+    """Follows one path and writes its first `room` photons from `place` on; the rest are counted alone.
+
+    Roulette keeps the largest channel of the flux, so that photons stay about equal. Flux is kept as what passes
+    through the shading normal's cosine, as radiance is: Veach 1997, eq. 5.19, half on arrival, half on leaving.
+    """
+    sampler = make_sampler(emission.seed, emission.map, path, emission.sampler)
+    beam = emit(scene, emission, sampler)
+    track = Track()
+    track.cell = beam.cell
+    o = beam.o
+    d = beam.d
+    flux = beam.flux
+    kind = int(DIRECT)
+    depth = int(0)
+    while wp.max(flux) > 0.0:
+        hit = closest_hit(scene, o, d)
+        track.rays = track.rays + 1
+        if hit.face < 0:
+            break
+        shape = scene.shapes[scene.face_shapes[hit.face]]
+        s = surface_at(scene, hit, shape)
+        wo = -d
+        n = s.n
+        if shape.kind != DIELECTRIC:
+            n = facing_normal(s, wo)
+        cos_real = wp.abs(wp.dot(s.ng, wo))
+        if cos_real == 0.0:
+            break
+        flux = flux * (wp.abs(wp.dot(n, wo)) / cos_real)
+        if shape.kind == DIFFUSE:
+            if not is_finite(flux):
+                track.dropped = track.dropped + 1
+                break
+            if emission.caustics == 0 or kind == CAUSTIC:
+                if track.stored < room:
+                    k = place + track.stored
+                    photons.position[k] = s.p
+                    photons.normal[k] = n
+                    photons.flux[k] = flux
+                    photons.kind[k] = kind
+                track.stored = track.stored + 1
+            if emission.caustics != 0:
+                break
+            kind = int(INDIRECT)
+        elif kind == DIRECT:
+            kind = int(CAUSTIC)
+
+        # scattering
+        pair = EMISSION_PAIRS + SCATTER_PAIRS * depth
+        b = sample(shape, s.albedo, n, wo, sample_2d(sampler, pair))
+        if wp.max(b.weight) <= 0.0 or (b.transmitted == 0 and not reflects(s, wo, b.wi)):
+            break
+        cos_shading = wp.abs(wp.dot(n, b.wi))
+        if cos_shading == 0.0:
+            break
+        # radiance shrinks by eta^2 where it is refracted, flux does not
+        weight = b.weight * (wp.abs(wp.dot(s.ng, b.wi)) / cos_shading)
+        if b.transmitted != 0:
+            weight = weight * (b.eta * b.eta)
+        left = wp.cw_mul(flux, weight)
+
+        # roulette
+        survival = wp.min(wp.max(left) / wp.max(flux), 1.0)
+        if depth >= LONG_PATH:
+            survival = wp.min(survival, LONG_SURVIVAL)
+        if sample_2d(sampler, pair + 1)[0] >= survival:
+            break
+        flux = left / survival
+        o = offset_origin(s.p, s.ng, s.offset, b.wi)
+        d = b.wi
+        depth = depth + 1
+    return track
+
+
+@wp.struct
+class Tracks:
+    stored: wp.array[int]
+    rays: wp.array[int]
+    dropped: wp.array[int]
+    cell: wp.array[int]
+
+
+@wp.kernel
+def shoot(offset: int, scene: Scene, emission: Emission, first_path: int, slots: int, photons: Photons, tracks: Tracks):
+    """One thread owns one path of a batch: its first `slots` photons, and how many there are."""
+    i = offset + wp.tid()
+    track = trace_photons(scene, emission, first_path + i, photons, i * slots, slots)
+    tracks.stored[i] = track.stored
+    tracks.rays[i] = track.rays
+    tracks.dropped[i] = track.dropped
+    tracks.cell[i] = track.cell
+
+
+@wp.kernel
+def pack(
+    offset: int,
+    scene: Scene,
+    emission: Emission,
+    first_path: int,
+    slots: int,
+    batch: Photons,
+    ends: wp.array[int],
+    photons: Photons,
+):
+    """One thread owns one path: puts its photons, which end before `ends[i]`, in a row with the others'.
+
+    The few paths that stored more than they had slots for are traced again, which is cheaper than slots for all.
+    """
+    i = offset + wp.tid()
+    start = int(0)
+    if i > 0:
+        start = ends[i - 1]
+    count = ends[i] - start
+    if count > slots:
+        trace_photons(scene, emission, first_path + i, photons, start, count)
+        return
+    for j in range(count):
+        photons.position[start + j] = batch.position[i * slots + j]
+        photons.normal[start + j] = batch.normal[i * slots + j]
+        photons.flux[start + j] = batch.flux[i * slots + j]
+        photons.kind[start + j] = batch.kind[i * slots + j]
