@@ -81,7 +81,7 @@ def figures_command(
 
     Args:
         out: PNG to write.
-        scene: Built-in scene.
+        scene: Built-in scene, or mitsuba-cornell-box: Mitsuba's own, which Mitsuba samples and path-traces.
         methods: Methods that work on samples: light-field, a-trous, ...
         size: Width and height of each panel in pixels.
         spp: Input samples per pixel.

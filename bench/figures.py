@@ -3,17 +3,28 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 import warpgi as gi
+from bench.mitsuba_peer import LLVM, require
 from bench.reference import make_reference
 from bench.report import progress
+from warpgi import checks
 from warpgi.image import check_output, write_png
 from warpgi.methods import RECONSTRUCTIONS, Method
+from warpgi.reconstruction import pixel_means
+
+#: Pictures of shape (H, W, 3) by name, and the reference's last; measures of all but that against it.
+Panels = tuple[dict[str, np.ndarray], list[dict[str, Any]]]
 
 GAP = 4  # pixels between panels
 WHITE = 1e4  # radiance of the gap
+
+# Mitsuba's own scene, sampled and path-traced by Mitsuba.
+MITSUBA_BOX = "mitsuba-cornell-box"
+MITSUBA_SPP = 64  # of one picture of its reference
 
 
 def side_by_side(
@@ -29,13 +40,42 @@ def side_by_side(
 ) -> None:
     """Indirect light of one scene, left to right: the input, each method, the path-traced reference."""
     check_output(out)
-    built = gi.scenes.build(scene)
-    panels: dict[str, Method] = {f"input, {spp} spp": gi.PathTracing(spp=spp)}
+    show = panels_of_mitsuba if scene == MITSUBA_BOX else panels_of_ours
+    panels, errors = show(scene, size, spp, chosen(methods, spp, rays), reference_spp, device)
+    for name, found in zip(panels, errors, strict=False):  # the reference has none
+        print(f"{name}: {', '.join(f'{kind} {value:.4g}' for kind, value in found.items() if value is not None)}")
+    gap = np.full((size[1], GAP, 3), WHITE, np.float32)
+    row = [part for picture in panels.values() for part in (picture, gap)][:-1]
+    write_png(out, np.concatenate(row, axis=1), exposure)
+    print(f"wrote {out}")
+
+
+def chosen(methods: tuple[str, ...], spp: int, rays: int) -> dict[str, Method]:
+    """Settings of the named methods.
+
+    Raises:
+        ValueError: one does not work on samples.
+    """
+    result = {}
     for name in methods:
         if name not in RECONSTRUCTIONS:
             raise ValueError(f"methods holds {name!r}, expected names out of {', '.join(RECONSTRUCTIONS)}")
         kind = RECONSTRUCTIONS[name]
-        panels[f"{name}, {spp} spp"] = kind(spp=spp, rays=rays) if hasattr(kind, "rays") else kind(spp=spp)
+        result[f"{name}, {spp} spp"] = kind(spp=spp, rays=rays) if hasattr(kind, "rays") else kind(spp=spp)
+    return result
+
+
+def panels_of_ours(
+    scene: str,
+    size: tuple[int, int],
+    spp: int,
+    methods: dict[str, Method],
+    reference_spp: int,
+    device: str | None,
+) -> Panels:
+    """Input, reconstructions and reference of a built-in scene, and the errors of all but the last."""
+    built = gi.scenes.build(scene)
+    panels: dict[str, Method] = {f"input, {spp} spp": gi.PathTracing(spp=spp)} | methods
     with progress() as bar:
         task = bar.add_task("reference", total=None)
         reference = make_reference(
@@ -45,14 +85,43 @@ def side_by_side(
             device=gi.Device(device),
             report=lambda done, total: bar.update(task, completed=done, total=total),
         )
+    pictures = {
+        name: gi.render(built, method, size, seed, device, progress=True).layers["indirect"]
+        for seed, (name, method) in enumerate(panels.items())
+    }
+    errors = [reference.judge(picture) for picture in pictures.values()]
+    return pictures | {"reference": reference.image}, errors
+
+
+def panels_of_mitsuba(
+    scene: str,
+    size: tuple[int, int],
+    spp: int,
+    methods: dict[str, Method],
+    reference_spp: int,
+    device: str | None,
+) -> Panels:
+    """The same of Mitsuba's own Cornell box: samples by Mitsuba, reconstructions, Mitsuba's reference.
+
+    Raises:
+        ValueError: the reference has no samples.
+        MissingPeer: Mitsuba is not installed, or its vectorised variant does not run here.
+    """
+    checks.count("reference_spp", reference_spp)
+    mi = require(LLVM)
+    box = mi.cornell_box()
+    box["sensor"]["film"] |= {"width": size[0], "height": size[1], "rfilter": {"type": "box"}}
+    loaded = mi.load_dict(box)
+    samples = gi.sample_from_mitsuba(loaded, spp, size)
+    panels = {f"input, {spp} spp": pixel_means(samples, samples.albedo * samples.radiance)} | {
+        name: gi.reconstruct(samples, method, device=device, progress=True).layers["indirect"]
+        for name, method in methods.items()
+    }
+    # pictures of one seed are of the same paths, so that their difference has no noise of direct light
+    whole, direct = (mi.load_dict({"type": "path", "max_depth": depth}) for depth in (-1, 2))
     pictures = [
-        gi.render(built, method, size, seed, device, progress=True).layers["indirect"]
-        for seed, method in enumerate(panels.values())
+        np.subtract(*(mi.render(loaded, integrator=path, spp=MITSUBA_SPP, seed=seed) for path in (whole, direct)))
+        for seed in range(-(-reference_spp // MITSUBA_SPP))
     ]
-    for name, picture in zip(panels, pictures, strict=True):
-        errors = reference.judge(picture)
-        print(f"{name}: {', '.join(f'{kind} {value:.4g}' for kind, value in errors.items() if value is not None)}")
-    gap = np.full((size[1], GAP, 3), WHITE, np.float32)
-    row = [part for picture in (*pictures, reference.image) for part in (picture, gap)][:-1]
-    write_png(out, np.concatenate(row, axis=1), exposure)
-    print(f"wrote {out}")
+    reference = np.mean(pictures, axis=0)
+    return panels | {"reference": reference}, [gi.compare(panel, reference) for panel in panels.values()]

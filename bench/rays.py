@@ -16,7 +16,7 @@ import warp as wp
 
 import warpgi as gi
 from bench.compiling import compile_rows
-from bench.mitsuba_peer import MitsubaPeer, NoCounterpart
+from bench.mitsuba_peer import MitsubaPeer
 from bench.photons import photon_rows
 from bench.reconstruction import AUTHORS, AUTHORS_YARDSTICK, SPP, stage_rows, yardstick
 from bench.report import Row, circumstances, paired_ratio, print_table, row, write_json
@@ -28,6 +28,7 @@ from warpgi.image import atomic_write
 from warpgi.job import Job
 from warpgi.kernels import rays as kernels
 from warpgi.kernels import tree_build
+from warpgi.mitsuba_scene import NoCounterpart
 from warpgi.render import versions
 from warpgi.scenes import build
 
@@ -280,7 +281,8 @@ def path_rows(
         row(scene.name, f"{what}, all rays", np.array(rays[1:]) / seconds["path tracing"], "rays/s"),
     ]
     if peer is not None:
-        rows.append(row(scene.name, f"mitsuba {peer.mitsuba.variant()} path", rates["mitsuba"], "paths/s"))
+        own = "" if peer.exact else "its own materials, close to ours"
+        rows.append(row(scene.name, f"mitsuba {peer.variant} path", rates["mitsuba"], "paths/s", note=own))
         rows += agreement_rows(scene.name, pictures, peer_pictures)
     return rows
 
@@ -333,5 +335,5 @@ def _settings_of_record(settings: Settings, device: gi.Device, peers: dict[str, 
     }
     for peer in peers.values():
         threads = {"threads": peer.drjit.thread_count(), "threads_set_by": "drjit.set_thread_count"}
-        record["mitsuba"] = {"variant": peer.mitsuba.variant(), "integrator": "path", **threads}
+        record["mitsuba"] = {"variant": peer.variant, "integrator": "path", "exact": peer.exact, **threads}
     return record

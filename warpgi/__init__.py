@@ -22,6 +22,8 @@ from warpgi.methods import (
     Sampler,
 )
 from warpgi.metrics import compare
+from warpgi.mitsuba_samples import sample_from_mitsuba
+from warpgi.mitsuba_scene import to_mitsuba
 from warpgi.progress import Progress
 from warpgi.reconstruct import reconstruct
 from warpgi.render import Interrupted, render, versions
@@ -65,6 +67,8 @@ __all__ = [
     "reconstruct",
     "render",
     "sample",
+    "sample_from_mitsuba",
     "scenes",
+    "to_mitsuba",
     "versions",
 ]
