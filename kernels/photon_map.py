@@ -46,10 +46,10 @@ class Maps:
 
     caustic: SplatTree  # photons L S+ D
     diffuse: SplatTree  # without gathering photons of all other indirect light
-    irradiance: SplatTree  # for gathering: irradiance of all light at some photons, radius in place of their size
+    irradiance: SplatTree  # for gathering: irradiance of all light at some points, which cover their radius
     caustic_look: Lookup
     diffuse_look: Lookup
-    reach2: float  # squared radii from such a point, where few photons make a radius
+    reach2: float  # that such a point's squared radius is raised by, where few photons make a radius
     near: float  # hits nearer than so many radii are no good for gathering, squared
 
 
@@ -64,8 +64,10 @@ class View:
 
 
 @wp.kernel
-def estimate_at(offset: int, scene: Scene, photons: SplatTree, look: Lookup, seed: int, points: SplatTree):
-    """One thread writes one block of `points`: the irradiance at its points by `photons`, and its radius squared."""
+def estimate_at(
+    offset: int, scene: Scene, photons: SplatTree, look: Lookup, reach2: float, seed: int, points: SplatTree
+):
+    """One thread writes one block of `points`: the irradiance at its points by `photons`, and how far it reaches."""
     block = offset + wp.tid()
     b = points.blocks
     guess2 = float(0.0)
@@ -76,7 +78,7 @@ def estimate_at(offset: int, scene: Scene, photons: SplatTree, look: Lookup, see
             n = wp.vec3(b[k + 24], b[k + 32], b[k + 40])
             found = density(photons, scene, look, x, n, guess2, block * LANES + lane, seed)
             guess2 = found.guess2
-            points.blocks[k + RADIUS_ROW] = found.radius2
+            points.blocks[k + RADIUS_ROW] = found.radius2 * reach2
             for axis in range(3):
                 points.blocks[k + (7 + axis) * LANES] = found.irradiance[axis]
 
@@ -105,11 +107,11 @@ def irradiance_near(maps: Maps, x: wp.vec3, n: wp.vec3):
     """That of the nearest point at which it is known, and whose estimate reaches here (Christensen 1999)."""
     result = Density()
     look = maps.diffuse_look
-    place = nearest_place(maps.irradiance, x, n, look.stretch, look.facing, maps.reach2)
+    place = nearest_place(maps.irradiance, x, n, look.stretch, look.facing)
     if place >= 0:
         k = (place // LANES) * BLOCK_STRIDE + place % LANES
         b = maps.irradiance.blocks
-        result.radius2 = b[k + RADIUS_ROW]
+        result.radius2 = b[k + RADIUS_ROW] / maps.reach2
         result.irradiance = wp.vec3(b[k + 56], b[k + 64], b[k + 72])
     return result
 
