@@ -7,8 +7,9 @@ from pathlib import Path
 
 import tyro
 
-from bench import figures, rays, reconstruction
+from bench import chart, figures, rays, reconstruction, stability
 
+BROKEN = 1  # exit status for a method that is worse than its bound
 MISUSE = 2  # exit status for a caller's mistake
 INTERRUPTED = 130
 
@@ -90,21 +91,77 @@ def figures_command(
     figures.light_field(out, scene, size, spp, rays, reference_spp, exposure, device)
 
 
+def chart_command(
+    scene: tuple[str, ...] = ("cornell-box", "courtyard"),
+    size: tuple[int, int] = (256, 256),
+    methods: tuple[str, ...] = (),
+    repeats: int = 3,
+    seed: int = 0,
+    reference_spp: int = 4096,
+    max_depth: int | None = None,
+    device: str | None = None,
+    threads: int | None = None,
+    out: Path = Path("out/chart"),
+    picture: Path | None = None,
+    quick: bool = False,
+    fresh: bool = False,
+) -> None:
+    """Chart error against seconds of every method and peer: tables, a PNG, an HTML page with the pictures.
+
+    Ctrl-C keeps what is finished, and reports it; the same command does what is missing.
+
+    Args:
+        scene: Built-in scenes or files, as warpgi render takes them.
+        size: Width and height in pixels.
+        methods: Which methods and peers; all by default.
+        repeats: Times that everything is measured, each with a seed of its own: times are medians, errors means.
+        seed: The first of these seeds.
+        reference_spp: Paths per pixel of the reference, which is kept in bench/cache.
+        max_depth: Longest path in segments; unlimited by default.
+        device: cpu, cuda, cuda:0, ...; a GPU if there is one.
+        threads: CPU threads; all by default.
+        out: Folder for results.json, chart.png, index.html, and the finished runs.
+        picture: Where the chart goes as a PNG instead of chart.png in that folder.
+        quick: A small chart within three minutes: 64 x 64 pixels, few settings, one repeat, a reference of 1024 spp.
+        fresh: Forget the finished runs in that folder.
+    """
+    settings = chart.ChartSettings(device, scene, size, methods, repeats, seed, reference_spp, max_depth, threads)
+    chart.run(settings.made_quick() if quick else settings, out, fresh, picture)
+
+
+def stability_command(
+    methods: tuple[str, ...] = (),
+    device: str | None = None,
+    threads: int | None = None,
+    out: Path = Path("out/chart"),
+) -> int:
+    """Measure what each method is known to do wrong; the exit status is 1 where a bound is broken.
+
+    Args:
+        methods: Which methods; all by default.
+        device: cpu, cuda, cuda:0, ...; a GPU if there is one.
+        threads: CPU threads; all by default.
+        out: Folder for stability.json, and of the chart whose page shows it.
+    """
+    return 0 if stability.run(out, methods, device, threads) else BROKEN
+
+
 def main(arguments: list[str] | None = None) -> int:
-    """Runs one command and returns its exit status: 0, or 2 for a caller's mistake, or 130 after Ctrl-C."""
+    """Runs one command and returns its exit status: 1: a bound is broken, 2: a caller's mistake, 130: Ctrl-C."""
     app = tyro.extras.SubcommandApp()
     app.command(rays_command, name="rays")
     app.command(figures_command, name="figures")
     app.command(scaling_command, name="scaling")
+    app.command(chart_command, name="chart")
+    app.command(stability_command, name="stability")
     try:
-        app.cli(prog="python -m bench", args=arguments, config=(tyro.conf.FlagCreatePairsOff,))
+        return app.cli(prog="python -m bench", args=arguments, config=(tyro.conf.FlagCreatePairsOff,)) or 0
     except KeyboardInterrupt:
         print("bench: interrupted", file=sys.stderr)
         return INTERRUPTED
     except (ValueError, TypeError, OSError) as error:
         print(f"bench: error: {error}", file=sys.stderr)
         return MISUSE
-    return 0
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import platform
 import subprocess
 from collections.abc import Sequence
@@ -13,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from warpgi.device import Device
@@ -81,6 +83,12 @@ def scaled(item: Row) -> tuple[float, str]:
     return 1.0, item.unit
 
 
+def progress() -> Progress:
+    """A bar on standard error, gone when it is done."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    return Progress(*columns, console=Console(stderr=True), transient=True)
+
+
 def circumstances(device: Device, versions: dict[str, str]) -> dict[str, Any]:
     """What a measurement depends on beside its settings."""
     return {
@@ -122,3 +130,12 @@ def write_json(path: Path, circumstances: dict[str, Any], settings: dict[str, An
     """Writes everything to `path`."""
     content = {**circumstances, "settings": settings, "rows": [asdict(item) for item in rows]}
     path.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+
+
+def finite(value: Any) -> Any:
+    """The same plain JSON with null where a number is infinite or none, as the PSNR of equal pictures is."""
+    if isinstance(value, dict):
+        return {key: finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

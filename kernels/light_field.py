@@ -3,13 +3,23 @@
 import warp as wp
 
 from warpgi.kernels.film import Film
-from warpgi.kernels.rng import SOBOL, make_sampler, sample_2d
+from warpgi.kernels.rng import SOBOL, SOBOL_PAIRS, make_sampler, sample_2d
 from warpgi.kernels.sampling import make_frame, square_to_cosine_hemisphere, to_world
-from warpgi.kernels.splats import SplatTree, first_surface, nearest_distance2, shrink_crossed
+from warpgi.kernels.splats import (
+    SplatTree,
+    first_surface,
+    nearest_distance2,
+    nearest_facing,
+    shrink_crossed,
+    splat_radiance,
+)
 
 wp.set_module_options({"enable_backward": False})
 
 FAR = wp.constant(1.0e30)  # beyond any scene
+
+# Of the random numbers: none that places a primary hit or aims an input ray, or rays would follow hits.
+GATHER_PAIR = wp.constant(SOBOL_PAIRS - 1)
 
 
 @wp.struct
@@ -158,9 +168,16 @@ def reconstruct(
     for ray in range(first_ray, first_ray + ray_count):
         # one sequence a pixel, cut into the shares of its samples
         sampler = make_sampler(seed, pixel, place * rays_each + ray, SOBOL)
-        d = to_world(frame, square_to_cosine_hemisphere(sample_2d(sampler, 0)))
+        d = to_world(frame, square_to_cosine_hemisphere(sample_2d(sampler, GATHER_PAIR)))
         s = first_surface(tree, o, d, noise, reach, keep_one, keep_two)
-        if s[3] > 0.0:
+        splat = int(-1)
+        if s[8] > 0.0:
+            splat = nearest_facing(tree, o + s[8] * d, d)
+        if splat >= 0:
+            # what faces away belongs to the other side of something thin, whose light may be quite another
+            total = total + splat_radiance(tree, splat)
+            near = near + s[4] / s[3]
+        elif s[3] > 0.0:
             total = total + wp.vec3(s[0], s[1], s[2]) / s[3]
             near = near + s[4] / s[3]
         elif sky.size > 0:

@@ -12,7 +12,7 @@ wp.set_module_options({"enable_backward": False})
 
 MAX_NEIGHBOURS = 32  # the length of the arrays in NEAREST
 
-vec8 = wp.types.vector(length=8, dtype=wp.float32)
+vec9 = wp.types.vector(length=9, dtype=wp.float32)
 
 
 @wp.struct
@@ -110,7 +110,8 @@ def search(keep: str, accept: str = "", node: str = "") -> str:
 
 
 # Squared distance to the k-th neighbour in that metric, the sample itself counted, and in Euclid's; samples at the
-# very same place are not neighbours, or they would vanish.
+# very same place are not neighbours, or they would vanish, nor are those that face elsewhere: they are of another
+# surface, or of the other side of something thin.
 NEAREST = (
     LANES_HEAD
     + """
@@ -122,7 +123,8 @@ NEAREST = (
     int found = 0;
     float worst = 1.0e30f;
 """
-    + search("""
+    + search(
+        """
                     int slot = found < want ? found++ : want - 1;
                     while (slot > 0 && metric[slot - 1] > m2[j]) {
                         metric[slot] = metric[slot - 1];
@@ -133,7 +135,9 @@ NEAREST = (
                     plain[slot] = d2[j];
                     if (found == want)
                         worst = metric[want - 1];
-""")
+""",
+        accept=" & (p[24 + j] * nx + p[32 + j] * ny + p[40 + j] * nz > 0.1f)",
+    )
     + "    return found > 0 ? plain[found - 1] : -1.0f;\n"
 )
 
@@ -255,8 +259,9 @@ def shrink_crossed(
 # conflicts where its event line meets the st plane in the positive, or in the negative, half-spaces of both (with the
 # authors' erratum); that is a b depth_i depth_j > 0 for a = (h_j - h_i).n_i and b = (h_j - h_i).n_j.
 # `keep_one` and `keep_two` are squared parts of their radius that splats keep which are alone, or two, in the surface.
-# Returns radiance times weight (3), weight, weight of splats nearer than `reach`, splats in the surface, and whether
-# the gather was cut short and how many undersampled surfaces were passed through.
+# Returns radiance times weight (3), weight, weight of splats nearer than `reach`, splats in the surface, whether
+# the gather was cut short, how many undersampled surfaces were passed through, and the distance of a surface whose
+# splats all face away, else 0.
 SURFACE = (
     WALK_HEAD
     + """
@@ -400,9 +405,16 @@ SURFACE = (
             within += t_of[j] < reach ? w : 0.0f;
         }
     }
-    wp::vec_t<8, wp::float32> result;
+    float seen_behind = 0.0f;
+    if (!any_front && inside > 0) {
+        seen_behind = 1.0e30f;
+        for (int j = 0; j < size; ++j)
+            seen_behind = smaller(seen_behind, t_of[j]);
+    }
+    wp::vec_t<9, wp::float32> result;
     result[0] = r; result[1] = g; result[2] = b; result[3] = weight; result[4] = within;
     result[5] = (float)inside; result[6] = (float)cut; result[7] = (float)surfaces_passed;
+    result[8] = seen_behind;
     return result;
 """
 )
@@ -411,4 +423,34 @@ SURFACE = (
 @wp.func_native(SURFACE)
 def first_surface(
     tree: SplatTree, o: wp.vec3, d: wp.vec3, noise: float, reach: float, keep_one: float, keep_two: float
-) -> vec8: ...
+) -> vec9: ...
+
+
+# The splat nearest to x among those that face a ray along d; -1 if none does.
+NEAREST_FACING = (
+    LANES_HEAD
+    + """
+    const int block0 = -1;
+    const float cx = x[0], cy = x[1], cz = x[2], nx = 0.0f, ny = 0.0f, nz = 0.0f, stretch = 0.0f;
+    float worst = 1.0e30f;
+    int nearest = -1;
+"""
+    + search(
+        """
+                    worst = m2[j];
+                    nearest = block * 8 + j;
+""",
+        accept=" & (p[24 + j] * d[0] + p[32 + j] * d[1] + p[40 + j] * d[2] < 0.0f)",
+    )
+    + "    return nearest;\n"
+)
+
+
+@wp.func_native(NEAREST_FACING)
+def nearest_facing(tree: SplatTree, x: wp.vec3, d: wp.vec3) -> int: ...
+
+
+@wp.func
+def splat_radiance(tree: SplatTree, splat: int):
+    at = (splat // 8) * 80 + splat % 8 + 56
+    return wp.vec3(tree.blocks[at], tree.blocks[at + 8], tree.blocks[at + 16])

@@ -62,7 +62,7 @@ def test_furnace(albedo, shape):
     def render(seed):
         result = gi.render(scene, light_field(), size=(12, 12), seed=seed)
         # 576 splats, 12 of them over each point on average and half of that in corners: gaps of e^-6
-        assert result.counts["missing_support"] <= 3e-3 * result.counts["reconstruction_rays"]
+        assert result.counts["missing_support"] <= np.exp(-6.0) * result.counts["reconstruction_rays"]
         return result.layers["indirect"]
 
     mean, error = means(render)
@@ -108,6 +108,21 @@ def test_rays_of_a_pixel_are_one_sequence(blocks):
         sums.append(state.reflected().numpy().reshape(-1, 4, 3))
     # sums over rays without support are left out of each mean, so that a pixel in a hundred weighs differently
     assert np.isclose(sums[0].mean(axis=1), sums[1][:, 0], rtol=1e-5).mean() > 0.9
+
+
+def test_rays_do_not_follow_primary_hits():
+    """As many primary hits as rays show the same picture: where a hit lies does not say where its ray goes."""
+    scene = gi.scenes.cornell_box()
+
+    def picture(hits):
+        method = light_field(light_samples=4, primary_hits=hits)
+        values = [gi.render(scene, method, size=(24, 24), seed=seed).layers["indirect"].mean(-1) for seed in range(12)]
+        return np.mean(values, axis=0), np.var(values, axis=0, ddof=1) / len(values)
+
+    (few, noise_few), (many, noise_many) = picture(4), picture(64)
+    z2 = np.square(few - many) / (noise_few + noise_many + 1e-9)
+    # over squares of Student's t with 22 degrees of freedom, whose mean is 22 / 20; hits share their input
+    assert z2.mean() < 22 / 20 + 4.0 * np.sqrt(2.0 / z2.size)
 
 
 def transformed(samples, scale, shift):
@@ -418,7 +433,7 @@ def test_sky_by_direction():
 def test_recursion_helps_where_one_sample_is_too_noisy():
     """With 1 spp and many bounces, light in corners is structured noise; recursive filtering cuts the relMSE."""
     scene, size = gi.scenes.cornell_box(), (64, 64)
-    reference = gi.render(scene, gi.PathTracing(spp=256), size=size, seed=91).layers["indirect"]
+    reference = gi.render(scene, gi.PathTracing(spp=512), size=size, seed=91).layers["indirect"]
     errors = np.array(
         [
             [
@@ -428,11 +443,11 @@ def test_recursion_helps_where_one_sample_is_too_noisy():
                 )["relmse"]
                 for k in (0, 1)
             ]
-            for seed in (1, 2, 3, 4)
+            for seed in range(1, 9)
         ]
     )
-    assert (errors[:, 1] < errors[:, 0]).all(), errors
-    assert errors[:, 1].mean() < 0.9 * errors[:, 0].mean()
+    assert stats.wilcoxon(errors[:, 0], errors[:, 1], alternative="greater").pvalue < 0.01, errors
+    assert errors[:, 1].mean() < 0.95 * errors[:, 0].mean()
 
 
 def test_recursion_keeps_the_mean():
@@ -454,9 +469,9 @@ def test_foliage_keeps_its_energy_and_range():
     incident = indirect(white, light_field(8, 32))
     assert (incident <= samples.radiance.max(axis=0) * (1.0 + 1e-5)).all() and (incident >= 0.0).all()
 
-    ours, error = means(lambda s: gi.render(scene, light_field(8, 32), size=size, seed=s).layers["indirect"], 4)
+    ours, error = means(lambda s: gi.render(scene, light_field(8, 32), size=size, seed=s).layers["indirect"], 8)
     traced, noise = means(
-        lambda s: gi.render(scene, gi.PathTracing(spp=64), size=size, seed=100 + s).layers["indirect"], 5
+        lambda s: gi.render(scene, gi.PathTracing(spp=64), size=size, seed=100 + s).layers["indirect"], 8
     )
     ratio, error = ours.mean() / traced.mean(), np.hypot(error.mean(), noise.mean()) / traced.mean()
     assert error < 0.01

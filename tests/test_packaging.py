@@ -128,7 +128,7 @@ def test_readme_pictures_have_their_commands():
     assert pictures
     for picture in pictures:
         assert (ROOT / picture).is_file()
-        assert re.search(rf"--out {re.escape(picture)}\b", text), picture
+        assert re.search(rf"--(out|picture) {re.escape(picture)}\b", text), picture
 
 
 def test_ci_runs_the_readmes_test_command():

@@ -9,7 +9,7 @@ import warp as wp
 import warpgi as gi
 from warpgi.kernels import light_field as kernels
 from warpgi.kernels.splats import SplatTree as SplatTreeStruct
-from warpgi.kernels.splats import first_surface, vec8
+from warpgi.kernels.splats import first_surface, nearest_facing, vec9
 from warpgi.reconstruction import NOISE_ULPS
 from warpgi.splat_tree import LANES, SplatTree
 
@@ -22,6 +22,7 @@ ALL_SIDES = [(0, 1, 2), (1, 2, 0), (2, 0, 1)]
 
 # Floating point: a few operations on float32 differences; ties closer than the second number are left out.
 ROUNDING, TIE = 2e-6, 2e-5
+SAME_SIDE = 0.1  # least cosine between the normals of neighbours
 
 
 @wp.kernel
@@ -32,11 +33,16 @@ def look(
     directions: wp.array[wp.vec3],
     noise: float,
     reach: float,
-    result: wp.array[vec8],
+    result: wp.array[vec9],
 ):
     """One thread owns one ray; splats alone, or two, keep 1/2 and 2/3 of their radius, as in section 2.5."""
     i = offset + wp.tid()
     result[i] = first_surface(tree, origins[i], directions[i], noise, reach, 0.25, 4.0 / 9.0)
+
+
+@wp.kernel
+def find_facing(offset: int, tree: SplatTreeStruct, x: wp.vec3, d: wp.vec3, nearest: wp.array[int]):
+    nearest[offset + wp.tid()] = nearest_facing(tree, x, d)
 
 
 class Splats:
@@ -74,10 +80,10 @@ class Splats:
         return rays
 
     def look(self, origins, directions, reach=1e30):
-        """Radiance, weight, weight within reach, splats in the surface, cut gathers, surfaces passed: (N, 8)."""
+        """Radiance, weight, weight within reach, splats, cut gathers, surfaces passed, where all face away: (N, 9)."""
         origins = np.asarray(origins, dtype=np.float32).reshape(-1, 3)
         directions = unit(np.asarray(directions, dtype=np.float64).reshape(-1, 3)).astype(np.float32)
-        result = self.device.zeros(len(origins), vec8)
+        result = self.device.zeros(len(origins), vec9)
         arrays = [self.device.array(x, wp.vec3) for x in (origins, directions)]
         self.device.launch(look, len(origins), [self.tree.struct, *arrays, self.noise, reach], [result])
         return result.numpy().astype(np.float64)
@@ -186,14 +192,20 @@ def brute_force_radius2(points, normals, k, which):
     for row, i in enumerate(which):
         d = points - points[i]
         plain = (d * d).sum(axis=1)
-        other = plain > 0.0  # neither itself nor a sample at the very same place
+        # neither itself nor a sample at the very same place, nor the other side of something thin
+        facing = normals @ normals[i]
+        other = (plain > 0.0) & (facing > SAME_SIDE)
+        unsure = np.abs(facing - SAME_SIDE).min() < 1e-6
+        if not other.any():
+            radius2[row] = 0.5 * 0.5 * 3.0  # half of its ray
+            continue
         plain = plain[other]
         metric = plain + STRETCH * (d[other] @ normals[i]) ** 2
         order = np.argsort(metric)
         place = min(k - 1, len(order)) - 1
         radius2[row] = plain[order[place]]
         tied = np.abs(metric - metric[order[place]]) < TIE * metric
-        sure[row] = np.ptp(plain[tied]) <= TIE * radius2[row]
+        sure[row] = np.ptp(plain[tied]) <= TIE * radius2[row] and not unsure
     return radius2, sure
 
 
@@ -202,7 +214,8 @@ def brute_force_radius2(points, normals, k, which):
 def test_radius_is_the_distance_of_the_kth_neighbour(count, k):
     """A splat's radius is the plain distance of the k-th sample, itself counted, in the metric that stretches along n.
 
-    With fewer than k samples the farthest counts; samples at the very same place are no neighbours.
+    With fewer than k samples the farthest counts; samples at the very same place are no neighbours, nor are those
+    that face another way.
     """
     points, normals = surfaces(count, seed=k)
     splats = Splats(points, normals)
@@ -389,6 +402,23 @@ def test_back_faces_give_radiance_only_among_themselves():
         for radiance, size, _ in both_orders(hits, normals, [LEAF, WALL], [0.8, 0.8], (0, 0, 3), (0, 0, -1)):
             assert size == 2
             np.testing.assert_allclose(radiance, expected, rtol=1e-5)
+
+
+def test_a_surface_that_faces_away_is_known_by_its_distance():
+    """The distance of the nearest splat where all face away, 0 where one does not; the facing one nearest is found."""
+    hits = [(0, 0, 0), (0.1, 0, -0.2), (0, 5, 0), (0, -3, 0), (0, 0.5, 0)]
+    up, down = (0, 0, 1), (0, 0, -1)
+    o, d = np.float32((0, 0, 3)), np.float32((0, 0, -1))
+    away = Splats(hits, [down, down, up, up, down], radii=0.8)
+    (found,) = away.look(o, d)
+    assert found[8] == pytest.approx(3.0)
+    nearest = away.device.zeros(1, int)
+    away.device.launch(
+        find_facing, 1, [away.tree.struct, wp.vec3(*(o + found[8] * d).tolist()), wp.vec3(*d)], [nearest]
+    )
+    assert away.order[nearest.numpy()[0]] == 3
+    (found,) = Splats(hits, [down, up, up, up, down], radii=0.8).look(o, d)
+    assert found[8] == 0.0
 
 
 @pytest.mark.parametrize("height", [1.0, 0.1, 0.01])

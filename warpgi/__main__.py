@@ -78,7 +78,7 @@ class RenderCommand:
 
     def run(self) -> None:
         device = _prepare(self.out, self.device, self.threads, self.memory_limit)
-        scene = _open_scene(self.scene)
+        scene = open_scene(self.scene)
 
         def work() -> gi.Render:
             ends: dict[str, Any] = {"seconds": self.seconds, "error": self.error, "checkpoint": self.checkpoint}
@@ -242,7 +242,7 @@ def _keep(picture: gi.Render, out: tuple[Path, ...], exposure: float) -> None:
         print(f"wrote {path}")
 
 
-def _open_scene(text: str) -> gi.Scene:
+def open_scene(text: str) -> gi.Scene:
     """A file where there is one or the name looks like one, else a built-in scene with its parameters."""
     if Path(text).suffix.lower() in SUFFIXES or Path(text).exists():
         return gi.load_scene(text)

@@ -1,0 +1,99 @@
+"""What the chart compares: every method at several settings of its quality knob, and other renderers where installed.
+
+A method of the library takes one line in `LADDERS`; anything else that makes an indirect layer, one in `PEERS`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import time
+from collections.abc import Callable
+from functools import cache
+
+import warpgi as gi
+from bench.contender import Contender, Place, Run, Settings, own_run, powers
+from bench.peer_contenders import mitsuba, oidn
+from bench.report import CHECKOUT
+
+
+def rays(*pairs: tuple[int, int]) -> tuple[Settings, ...]:
+    """Samples and reconstruction rays per pixel."""
+    return tuple({"spp": spp, "rays": count} for spp, count in pairs)
+
+
+#: Name in METHODS -> values of its quality knob, cheapest first.
+LADDERS: dict[str, tuple[Settings, ...]] = {
+    "path": powers(512),
+    "light-field": rays((1, 16), (1, 64), (2, 64), (4, 64), (4, 256), (8, 128), (8, 256), (8, 512), (16, 512)),
+    "a-trous": powers(64),
+    "random-parameter-filter": powers(16),
+    "irradiance-filter": powers(64),
+}
+
+#: Methods without an indirect layer, and why.
+NO_LIGHT = {"ambient-occlusion": "its picture is occlusion, not light"}
+
+#: Name -> maker of a contender that needs more than the library; an ImportError or ValueError says what is missing.
+PEERS: dict[str, Callable[[], Contender]] = {
+    "mitsuba scalar_rgb": lambda: mitsuba("scalar_rgb"),
+    "mitsuba llvm_ad_rgb": lambda: mitsuba("llvm_ad_rgb"),
+    "oidn": oidn,
+}
+
+
+def own(name: str, ladder: tuple[Settings, ...]) -> Contender:
+    """A method of the library."""
+    kind = gi.METHODS[name]
+    fields = {field.name for field in dataclasses.fields(kind)}
+
+    def load(place: Place) -> Callable[[Settings, int], Run]:
+        depth = {"max_depth": place.max_depth} if "max_depth" in fields else {}
+        start = time.perf_counter()
+        place.device.load(kind(**depth, **ladder[0]).kernels)
+        compile_seconds = time.perf_counter() - start
+
+        def run(settings: Settings, seed: int) -> Run:
+            render = gi.render(place.scene, kind(**depth, **settings), place.size, seed, place.device)
+            return own_run(render, render.layers["indirect"], compile_seconds)
+
+        return run
+
+    return Contender(name, ladder, load, sources())
+
+
+@cache
+def sources() -> str:
+    """Digest of the library's sources, on which errors and seconds of its methods depend."""
+    digest = hashlib.blake2b(digest_size=10)
+    for folder in ("kernels", "warpgi"):
+        for path in sorted((CHECKOUT / folder).rglob("*.py")):
+            digest.update(path.relative_to(CHECKOUT).as_posix().encode() + path.read_bytes())
+    return digest.hexdigest()
+
+
+def contenders(names: tuple[str, ...] = ()) -> tuple[list[Contender], list[str]]:
+    """Those of the given names, or all, and a line for each that is left out.
+
+    Raises:
+        ValueError: there is no such contender.
+    """
+    known = [*gi.METHODS, *PEERS]
+    for name in names:
+        if name not in known:
+            raise ValueError(f"methods holds {name!r}, expected some of {', '.join(known)}")
+    found: list[Contender] = []
+    notes: list[str] = []
+    for name in names or known:
+        if name in NO_LIGHT:
+            notes.append(f"{name} is left out: {NO_LIGHT[name]}")
+        elif name in PEERS:
+            try:
+                found.append(PEERS[name]())
+            except (ImportError, ValueError) as error:
+                notes.append(f"{name} is left out: {error}")
+        elif name in LADDERS:
+            found.append(own(name, LADDERS[name]))
+        else:
+            notes.append(f"{name} is left out: it has no line in bench/contenders.py")
+    return found, notes
