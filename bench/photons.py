@@ -15,8 +15,8 @@ from bench.report import Row, paired_ratio, row
 from bench.turns import take_turns
 from warpgi.device_scene import DeviceScene
 from warpgi.job import Job
+from warpgi.kernels.density import vec8
 from warpgi.kernels.photon_map import nearest_of_each
-from warpgi.kernels.splats import vec8
 from warpgi.methods.photon_map import Mapping
 from warpgi.photons import Shot
 

@@ -6,9 +6,11 @@ from warpgi.kernels.lanes import LANES_HEAD
 from warpgi.kernels.rng import SOBOL, make_sampler, sample_2d
 from warpgi.kernels.sampling import PI, make_frame, square_to_disc
 from warpgi.kernels.scene import Scene, closest_hit
-from warpgi.kernels.splats import SplatTree, search, vec8
+from warpgi.kernels.splats import SplatTree, search
 
 wp.set_module_options({"enable_backward": False})
+
+vec8 = wp.types.vector(length=8, dtype=wp.float32)
 
 MAX_PHOTONS = 256  # half the length of the arrays in NEAREST_PHOTONS
 

@@ -5,7 +5,7 @@ import warp as wp
 from warpgi.kernels.bsdf import sample
 from warpgi.kernels.bvh import BLOCK_STRIDE, LANES, RADIUS_ROW
 from warpgi.kernels.camera import Camera
-from warpgi.kernels.density import GUESS_NEARBY, Density, Lookup, density, nearest_photons, nearest_place
+from warpgi.kernels.density import GUESS_NEARBY, Density, Lookup, density, nearest_photons, nearest_place, vec8
 from warpgi.kernels.direct import add_features, direct_light, emission_weight, emitted, facing_normal, reflects
 from warpgi.kernels.film import Film, PathSample, add_sample
 from warpgi.kernels.path import CAMERA_PAIRS, VERTEX_PAIRS, add_light, pixel_ray
@@ -24,7 +24,7 @@ from warpgi.kernels.scene import (
     offset_origin,
     surface_at,
 )
-from warpgi.kernels.splats import SplatTree, vec8
+from warpgi.kernels.splats import SplatTree
 
 wp.set_module_options({"enable_backward": False})
 

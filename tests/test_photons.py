@@ -14,12 +14,20 @@ import warpgi as gi
 import warpgi.photons
 from warpgi.device_scene import DeviceScene
 from warpgi.job import Job
-from warpgi.kernels.density import Density, Lookup, density, kernel_weight, near_photons, nearest_photons, nearest_place
+from warpgi.kernels.density import (
+    Density,
+    Lookup,
+    density,
+    kernel_weight,
+    near_photons,
+    nearest_photons,
+    nearest_place,
+    vec8,
+)
 from warpgi.kernels.photons import CAUSTIC, DIRECT, INDIRECT
 from warpgi.kernels.rng import INDEPENDENT, SOBOL
 from warpgi.kernels.scene import Scene
 from warpgi.kernels.splats import SplatTree as SplatTreeStruct
-from warpgi.kernels.splats import vec8
 from warpgi.methods.photon_map import SHAPES, Mapping
 from warpgi.photons import PhotonSource
 from warpgi.scenes import furnace, leak, room
