@@ -173,7 +173,8 @@ def incident_light(
         pair = GATHER_PAIR + 4 * step
         direct = 0
         if shape.kind == DIFFUSE:
-            found = irradiance_near(maps, s.p, n)
+            side = s.ng * wp.sign(wp.dot(s.ng, wo))
+            found = irradiance_near(maps, s.p, side)
             if near >= MAX_NEAR or travelled * travelled >= maps.near * found.radius2:
                 reflected = wp.cw_mul(throughput, wp.cw_mul(s.albedo, found.irradiance)) * INV_PI
                 result.radiance = result.radiance + reflected
@@ -186,7 +187,7 @@ def incident_light(
                 sampled = direct_light(scene, shape, s, n, wo, sample_2d(sampler, pair), choice, 1.0)
                 result.shadow_rays = result.shadow_rays + sampled.shadow_rays
                 result.radiance = result.radiance + wp.cw_mul(throughput, sampled.radiance)
-            caustic = density(maps.caustic, scene, maps.caustic_look, s.p, n, 0.0, key, index)
+            caustic = density(maps.caustic, scene, maps.caustic_look, s.p, side, 0.0, key, index)
             result.closest_hit_rays = result.closest_hit_rays + caustic.rays
             reflected = wp.cw_mul(throughput, wp.cw_mul(s.albedo, caustic.irradiance)) * INV_PI
             result.radiance = result.radiance + reflected
@@ -337,11 +338,12 @@ def follow(scene: Scene, maps: Maps, view: View, pixel: int, index: int, sampler
                     light = direct_light(scene, shape, s, n, wo, u, choice, float(rays) * light_part)
                     path.shadow_rays = path.shadow_rays + light.shadow_rays
                     path = add_light(path, depth + 1, wp.cw_mul(throughput, light.radiance) * light_part)
-            found = density(maps.caustic, scene, maps.caustic_look, s.p, n, 0.0, pixel, index)
+            side = s.ng * wp.sign(wp.dot(s.ng, wo))  # discs lie on the real surface
+            found = density(maps.caustic, scene, maps.caustic_look, s.p, side, 0.0, pixel, index)
             path.closest_hit_rays = path.closest_hit_rays + found.rays
             irradiance = found.irradiance
             if view.gather == 0:
-                found = density(maps.diffuse, scene, maps.diffuse_look, s.p, n, 0.0, pixel, index)
+                found = density(maps.diffuse, scene, maps.diffuse_look, s.p, side, 0.0, pixel, index)
                 path.closest_hit_rays = path.closest_hit_rays + found.rays
                 irradiance = irradiance + found.irradiance
             reflectance = wp.cw_mul(throughput, s.albedo)

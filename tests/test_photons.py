@@ -166,6 +166,30 @@ def test_lights_from_outside(light, expected):
     assert abs(flux_z(shot, expected)) < Z_LIMIT
 
 
+def test_a_spot_is_as_bright_as_its_cone_says():
+    """The mean cosine to a spot's axis, over its flux, is that of KHR_lights_punctual's intensity."""
+    shapes = [box(2.0, flip=True, material=gi.Diffuse(0.0))]
+    shot = source_of(gi.Scene(shapes, CAMERA, [gi.SpotLight((0, 0, 0), (0, -1, 0), 3.0, INNER, OUTER)])).shoot(
+        50_000, 0
+    )
+    position, _, flux, _ = (a.astype(np.float64) for a in arrays(shot))
+    cosine = -position[:, 1] / np.linalg.norm(position, axis=1)
+    inner, outer = math.cos(INNER), math.cos(OUTER)
+    c = np.linspace(outer, 1.0, 100_001)
+    intensity = np.clip((c - outer) / (inner - outer), 0.0, 1.0) ** 2
+    error = cosine.std() / math.sqrt(len(cosine))
+    assert abs((cosine * flux[:, 0]).sum() / flux[:, 0].sum() - (c * intensity).sum() / intensity.sum()) < 4.4 * error
+
+
+def test_aimed_flux_in_closed_form():
+    """A window of a glass that does nothing, as wide as a cube's side, gets a sixth of a point light's flux."""
+    window = gi.Shape(np.subtract(np.multiply(PANE[0], (5, 1, 5)), (0, 1, 0)), PANE[1], gi.Dielectric(1.0))
+    scene = gi.Scene([box(6.0, flip=True, material=gi.Diffuse(0.0)), window], CAMERA, [gi.PointLight((0, 0, 0), 1.0)])
+    shot = source_of(scene).shoot_caustics(50_000, 0)
+    assert abs(flux_z(shot, 4.0 * math.pi / 6.0)) < Z_LIMIT
+    assert shot.count > 0.4 * shot.paths
+
+
 def test_photons_are_of_equal_power():
     """Roulette keeps the largest channel of the flux, whatever surfaces do to it."""
     flux = arrays(source_of(gi.scenes.cornell_box()).shoot(5000, 0))[2]
