@@ -26,6 +26,17 @@ def rays(*pairs: tuple[int, int]) -> tuple[Settings, ...]:
 LADDERS: dict[str, tuple[Settings, ...]] = {
     "path": powers(512),
     "light-field": rays((1, 16), (1, 64), (2, 64), (4, 64), (4, 256), (8, 128), (8, 256), (8, 512), (16, 512)),
+    "photon-map": tuple(
+        {"spp": spp, "photons": photons, "caustic_photons": photons, "final_gather": rays}
+        for spp, photons, rays in (
+            (1, 20_000, 0),
+            (4, 50_000, 4),
+            (8, 100_000, 8),
+            (16, 200_000, 8),
+            (16, 200_000, 32),
+            (64, 400_000, 16),
+        )
+    ),
     "a-trous": powers(64),
     "random-parameter-filter": powers(16),
     "irradiance-filter": powers(64),

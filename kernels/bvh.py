@@ -143,9 +143,16 @@ def write_box(nodes: wp.array[float], node: int, child: int, low: wp.vec3, high:
 
 @wp.kernel
 def fit_leaves(
-    offset: int, blocks: wp.array[float], block_count: int, first_node: int, margin: float, nodes: wp.array[float]
+    offset: int,
+    blocks: wp.array[float],
+    block_count: int,
+    first_node: int,
+    margin: float,
+    flat: float,
+    nodes: wp.array[float],
 ):
-    """One thread owns a node of the lowest level: the boxes of its eight blocks' discs, grown by `margin`."""
+    """One thread owns a node of the lowest level: the boxes of its eight blocks' discs, or balls where `flat` is 0,
+    grown by `margin`."""
     i = offset + wp.tid()
     for child in range(LANES):
         low = wp.vec3(EMPTY)
@@ -158,11 +165,11 @@ def fit_leaves(
                 if r2 >= 0.0:
                     p = wp.vec3(blocks[place], blocks[place + 8], blocks[place + 16])
                     n = wp.vec3(blocks[place + 24], blocks[place + 32], blocks[place + 40])
-                    # a disc reaches r sqrt(1 - n^2) along an axis
+                    # a disc reaches r sqrt(1 - n^2) along an axis, a ball r
                     e = wp.vec3(
-                        wp.sqrt(r2 * wp.max(0.0, 1.0 - n[0] * n[0])) + margin,
-                        wp.sqrt(r2 * wp.max(0.0, 1.0 - n[1] * n[1])) + margin,
-                        wp.sqrt(r2 * wp.max(0.0, 1.0 - n[2] * n[2])) + margin,
+                        wp.sqrt(r2 * wp.max(0.0, 1.0 - flat * n[0] * n[0])) + margin,
+                        wp.sqrt(r2 * wp.max(0.0, 1.0 - flat * n[1] * n[1])) + margin,
+                        wp.sqrt(r2 * wp.max(0.0, 1.0 - flat * n[2] * n[2])) + margin,
                     )
                     low = wp.min(low, p - e)
                     high = wp.max(high, p + e)

@@ -215,7 +215,8 @@ def near_photons(
 ) -> vec8: ...
 
 
-# Place of the nearest lane whose own radius, times the root of `reach2`, covers the point; -1: none.
+# Place of the nearest lane whose own radius covers the point; -1: none. Boxes hold the lanes' balls, so that the point
+# is in the boxes of all that cover it.
 NEAREST_PLACE = (
     LANES_HEAD
     + AT_POINT
@@ -225,14 +226,16 @@ NEAREST_PLACE = (
                     worst = m2[j];
                     found = block * 8 + j;
 """,
-        FACING + " & (m2[j] <= reach2 * p[48 + j])",
-    ).replace("(d2[j] > 0.0f) & ", "")
+        FACING + " & (m2[j] <= p[48 + j])",
+    )
+    .replace("(d2[j] > 0.0f) & ", "")
+    .replace("met[j] = (int)(d2[j] < worst)", "met[j] = (int)(d2[j] == 0.0f)")
     + "    return found;\n"
 )
 
 
 @wp.func_native(NEAREST_PLACE)
-def nearest_place(tree: SplatTree, x: wp.vec3, n: wp.vec3, stretch: float, facing: float, reach2: float) -> int: ...
+def nearest_place(tree: SplatTree, x: wp.vec3, n: wp.vec3, stretch: float, facing: float) -> int: ...
 
 
 # The k-th photon of a search nearby is rarely farther, by the squares.

@@ -46,10 +46,10 @@ class Maps:
 
     caustic: SplatTree  # photons L S+ D
     diffuse: SplatTree  # without gathering photons of all other indirect light
-    irradiance: SplatTree  # for gathering: irradiance of all light at some photons, radius in place of their size
+    irradiance: SplatTree  # for gathering: irradiance of all light at some points, which cover their radius
     caustic_look: Lookup
     diffuse_look: Lookup
-    reach2: float  # squared radii from such a point, where few photons make a radius
+    reach2: float  # that such a point's squared radius is raised by, where few photons make a radius
     near: float  # hits nearer than so many radii are no good for gathering, squared
 
 
@@ -64,8 +64,10 @@ class View:
 
 
 @wp.kernel
-def estimate_at(offset: int, scene: Scene, photons: SplatTree, look: Lookup, seed: int, points: SplatTree):
-    """One thread writes one block of `points`: the irradiance at its points by `photons`, and its radius squared."""
+def estimate_at(
+    offset: int, scene: Scene, photons: SplatTree, look: Lookup, reach2: float, seed: int, points: SplatTree
+):
+    """One thread writes one block of `points`: the irradiance at its points by `photons`, and how far it reaches."""
     block = offset + wp.tid()
     b = points.blocks
     guess2 = float(0.0)
@@ -76,7 +78,7 @@ def estimate_at(offset: int, scene: Scene, photons: SplatTree, look: Lookup, see
             n = wp.vec3(b[k + 24], b[k + 32], b[k + 40])
             found = density(photons, scene, look, x, n, guess2, block * LANES + lane, seed)
             guess2 = found.guess2
-            points.blocks[k + RADIUS_ROW] = found.radius2
+            points.blocks[k + RADIUS_ROW] = found.radius2 * reach2
             for axis in range(3):
                 points.blocks[k + (7 + axis) * LANES] = found.irradiance[axis]
 
@@ -105,11 +107,11 @@ def irradiance_near(maps: Maps, x: wp.vec3, n: wp.vec3):
     """That of the nearest point at which it is known, and whose estimate reaches here (Christensen 1999)."""
     result = Density()
     look = maps.diffuse_look
-    place = nearest_place(maps.irradiance, x, n, look.stretch, look.facing, maps.reach2)
+    place = nearest_place(maps.irradiance, x, n, look.stretch, look.facing)
     if place >= 0:
         k = (place // LANES) * BLOCK_STRIDE + place % LANES
         b = maps.irradiance.blocks
-        result.radius2 = b[k + RADIUS_ROW]
+        result.radius2 = b[k + RADIUS_ROW] / maps.reach2
         result.irradiance = wp.vec3(b[k + 56], b[k + 64], b[k + 72])
     return result
 
@@ -171,7 +173,8 @@ def incident_light(
         pair = GATHER_PAIR + 4 * step
         direct = 0
         if shape.kind == DIFFUSE:
-            found = irradiance_near(maps, s.p, n)
+            side = s.ng * wp.sign(wp.dot(s.ng, wo))
+            found = irradiance_near(maps, s.p, side)
             if near >= MAX_NEAR or travelled * travelled >= maps.near * found.radius2:
                 reflected = wp.cw_mul(throughput, wp.cw_mul(s.albedo, found.irradiance)) * INV_PI
                 result.radiance = result.radiance + reflected
@@ -184,7 +187,7 @@ def incident_light(
                 sampled = direct_light(scene, shape, s, n, wo, sample_2d(sampler, pair), choice, 1.0)
                 result.shadow_rays = result.shadow_rays + sampled.shadow_rays
                 result.radiance = result.radiance + wp.cw_mul(throughput, sampled.radiance)
-            caustic = density(maps.caustic, scene, maps.caustic_look, s.p, n, 0.0, key, index)
+            caustic = density(maps.caustic, scene, maps.caustic_look, s.p, side, 0.0, key, index)
             result.closest_hit_rays = result.closest_hit_rays + caustic.rays
             reflected = wp.cw_mul(throughput, wp.cw_mul(s.albedo, caustic.irradiance)) * INV_PI
             result.radiance = result.radiance + reflected
@@ -335,11 +338,12 @@ def follow(scene: Scene, maps: Maps, view: View, pixel: int, index: int, sampler
                     light = direct_light(scene, shape, s, n, wo, u, choice, float(rays) * light_part)
                     path.shadow_rays = path.shadow_rays + light.shadow_rays
                     path = add_light(path, depth + 1, wp.cw_mul(throughput, light.radiance) * light_part)
-            found = density(maps.caustic, scene, maps.caustic_look, s.p, n, 0.0, pixel, index)
+            side = s.ng * wp.sign(wp.dot(s.ng, wo))  # discs lie on the real surface
+            found = density(maps.caustic, scene, maps.caustic_look, s.p, side, 0.0, pixel, index)
             path.closest_hit_rays = path.closest_hit_rays + found.rays
             irradiance = found.irradiance
             if view.gather == 0:
-                found = density(maps.diffuse, scene, maps.diffuse_look, s.p, n, 0.0, pixel, index)
+                found = density(maps.diffuse, scene, maps.diffuse_look, s.p, side, 0.0, pixel, index)
                 path.closest_hit_rays = path.closest_hit_rays + found.rays
                 irradiance = irradiance + found.irradiance
             reflectance = wp.cw_mul(throughput, s.albedo)

@@ -54,7 +54,7 @@ class Emission:
 @wp.struct
 class Photons:
     position: wp.array[wp.vec3]
-    normal: wp.array[wp.vec3]  # of the surface, on the side that the light came from
+    normal: wp.array[wp.vec3]  # of the real surface, on the side that the light came from
     flux: wp.array[wp.vec3]  # [W]
     kind: wp.array[int]  # DIRECT, CAUSTIC or INDIRECT
 
@@ -196,8 +196,8 @@ class Track:
 def trace_photons(scene: Scene, emission: Emission, path: int, photons: Photons, place: int, room: int):
     """Follows one path and writes its first `room` photons from `place` on; the rest are counted alone.
 
-    Roulette keeps the largest channel of the flux, so that photons stay about equal. Flux is kept as what passes
-    through the shading normal's cosine, as radiance is: Veach 1997, eq. 5.19, half on arrival, half on leaving.
+    Roulette keeps the largest channel of the flux, so that photons stay about equal. Shading normals weigh the flux by
+    the cosines that a path from the camera would have there (Veach 1997, eq. 5.19).
     """
     sampler = make_sampler(emission.seed, emission.map, path, emission.sampler)
     beam = emit(scene, emission, sampler)
@@ -222,48 +222,55 @@ def trace_photons(scene: Scene, emission: Emission, path: int, photons: Photons,
         cos_real = wp.abs(wp.dot(s.ng, wo))
         if cos_real == 0.0:
             break
-        flux = flux * (wp.abs(wp.dot(n, wo)) / cos_real)
+        pair = EMISSION_PAIRS + SCATTER_PAIRS * depth
+        left = wp.vec3(0.0)
+        d = wp.vec3(0.0)
         if shape.kind == DIFFUSE:
+            # the sides of the normals that the light came to
+            side = wp.sign(wp.dot(s.ng, wo))
+            ng = s.ng * side
+            ns = s.n * side
+            arrived = flux * (wp.max(wp.dot(ns, wo), 0.0) / cos_real)
             if not is_finite(flux):
                 track.dropped = track.dropped + 1
                 break
-            if emission.caustics == 0 or kind == CAUSTIC:
+            if wp.max(arrived) > 0.0 and (emission.caustics == 0 or kind == CAUSTIC):
                 if track.stored < room:
                     k = place + track.stored
                     photons.position[k] = s.p
-                    photons.normal[k] = n
-                    photons.flux[k] = flux
+                    photons.normal[k] = ng
+                    photons.flux[k] = arrived
                     photons.kind[k] = kind
                 track.stored = track.stored + 1
             if emission.caustics != 0:
                 break
             kind = int(INDIRECT)
-        elif kind == DIRECT:
-            kind = int(CAUSTIC)
-
-        # scattering
-        pair = EMISSION_PAIRS + SCATTER_PAIRS * depth
-        b = sample(shape, s.albedo, n, wo, sample_2d(sampler, pair))
-        if wp.max(b.weight) <= 0.0 or (b.transmitted == 0 and not reflects(s, wo, b.wi)):
-            break
-        cos_shading = wp.abs(wp.dot(n, b.wi))
-        if cos_shading == 0.0:
-            break
-        # radiance shrinks by eta^2 where it is refracted, flux does not
-        weight = b.weight * (wp.abs(wp.dot(s.ng, b.wi)) / cos_shading)
-        if b.transmitted != 0:
-            weight = weight * (b.eta * b.eta)
-        left = wp.cw_mul(flux, weight)
+            # away along the real surface; who looks from there sees the shading normal unless it is turned away
+            d = to_world(make_frame(ng), square_to_cosine_hemisphere(sample_2d(sampler, pair)))
+            seen = wp.where(wp.dot(ns, d) > 0.0, ns, ng)
+            left = wp.cw_mul(flux, s.albedo) * (wp.max(wp.dot(seen, wo), 0.0) / cos_real)
+        else:
+            if kind == DIRECT:
+                kind = int(CAUSTIC)
+            b = sample(shape, s.albedo, n, wo, sample_2d(sampler, pair))
+            cos_shading = wp.abs(wp.dot(n, b.wi))
+            if wp.max(b.weight) <= 0.0 or cos_shading == 0.0 or (b.transmitted == 0 and not reflects(s, wo, b.wi)):
+                break
+            d = b.wi
+            left = wp.cw_mul(flux, b.weight) * (
+                wp.abs(wp.dot(n, wo)) / cos_real * wp.abs(wp.dot(s.ng, d)) / cos_shading
+            )
+            if b.transmitted != 0:
+                left = left * (b.eta * b.eta)  # radiance shrinks by that where it is refracted, flux does not
 
         # roulette
         survival = wp.min(wp.max(left) / wp.max(flux), 1.0)
         if depth >= LONG_PATH:
             survival = wp.min(survival, LONG_SURVIVAL)
-        if sample_2d(sampler, pair + 1)[0] >= survival:
+        if survival <= 0.0 or sample_2d(sampler, pair + 1)[0] >= survival:
             break
         flux = left / survival
-        o = offset_origin(s.p, s.ng, s.offset, b.wi)
-        d = b.wi
+        o = offset_origin(s.p, s.ng, s.offset, d)
         depth = depth + 1
     return track
 

@@ -50,6 +50,21 @@ def test_path_tracing_is_the_default_and_scene_parameters_work(tmp_path, capsys)
     assert gi.Render.load(out).image.mean() == pytest.approx(4.0, rel=0.2)
 
 
+def test_a_render_goes_on_from_its_checkpoint(tmp_path, capsys):
+    """--checkpoint keeps what --seconds or a smaller --spp left undone, and the next run ends as one run would."""
+    out, half = tmp_path / "a.exr", tmp_path / "half.npz"
+    arguments = ["--size", "8", "8", "--device", "cpu", "--out", str(out)]
+    method = ["photon-map", "--photons", "1000", "--caustic-photons", "1000", "--map-spp", "2"]
+    for spp in ("3", "6"):
+        command = ["render", "caustic", *arguments, "--checkpoint", str(half), *method, "--spp", spp]
+        assert main(command) == 0
+    whole = gi.PhotonMap(photons=1000, caustic_photons=1000, map_spp=2, spp=6)
+    expected = gi.render(gi.scenes.build("caustic"), whole, (8, 8), device="cpu")
+    np.testing.assert_array_equal(gi.Render.load(out).image, expected.image)
+    assert main(["render", "caustic", *arguments, "--checkpoint", str(half), "--seed", "1", *method]) == 2
+    assert "is of another render: seed is 0 there, 1 here" in capsys.readouterr().err
+
+
 def test_a_mesh_file_of_ones_own(tmp_path, capsys):
     """A file is a scene too, by its suffix."""
     mesh = tmp_path / "tetra.obj"

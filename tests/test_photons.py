@@ -59,6 +59,7 @@ def estimate(
 def search(
     offset: int,
     tree: SplatTreeStruct,
+    covers: SplatTreeStruct,
     x: wp.array[wp.vec3],
     n: wp.array[wp.vec3],
     k: int,
@@ -74,7 +75,7 @@ def search(
     i = offset + wp.tid()
     result[i] = nearest_photons(tree, x[i], n[i], k, guess2, limit2, 1.0, stretch, facing, 0)
     near[i] = near_photons(tree, x[i], n[i], limit2, stretch, facing, 0)
-    place[i] = nearest_place(tree, x[i], n[i], stretch, facing, 0.25)
+    place[i] = nearest_place(covers, x[i], n[i], stretch, facing)
 
 
 @wp.kernel
@@ -165,6 +166,30 @@ def test_lights_from_outside(light, expected):
     assert abs(flux_z(shot, expected)) < Z_LIMIT
 
 
+def test_a_spot_is_as_bright_as_its_cone_says():
+    """The mean cosine to a spot's axis, over its flux, is that of KHR_lights_punctual's intensity."""
+    shapes = [box(2.0, flip=True, material=gi.Diffuse(0.0))]
+    shot = source_of(gi.Scene(shapes, CAMERA, [gi.SpotLight((0, 0, 0), (0, -1, 0), 3.0, INNER, OUTER)])).shoot(
+        50_000, 0
+    )
+    position, _, flux, _ = (a.astype(np.float64) for a in arrays(shot))
+    cosine = -position[:, 1] / np.linalg.norm(position, axis=1)
+    inner, outer = math.cos(INNER), math.cos(OUTER)
+    c = np.linspace(outer, 1.0, 100_001)
+    intensity = np.clip((c - outer) / (inner - outer), 0.0, 1.0) ** 2
+    error = cosine.std() / math.sqrt(len(cosine))
+    assert abs((cosine * flux[:, 0]).sum() / flux[:, 0].sum() - (c * intensity).sum() / intensity.sum()) < 4.4 * error
+
+
+def test_aimed_flux_in_closed_form():
+    """A window of a glass that does nothing, as wide as a cube's side, gets a sixth of a point light's flux."""
+    window = gi.Shape(np.subtract(np.multiply(PANE[0], (5, 1, 5)), (0, 1, 0)), PANE[1], gi.Dielectric(1.0))
+    scene = gi.Scene([box(6.0, flip=True, material=gi.Diffuse(0.0)), window], CAMERA, [gi.PointLight((0, 0, 0), 1.0)])
+    shot = source_of(scene).shoot_caustics(50_000, 0)
+    assert abs(flux_z(shot, 4.0 * math.pi / 6.0)) < Z_LIMIT
+    assert shot.count > 0.4 * shot.paths
+
+
 def test_photons_are_of_equal_power():
     """Roulette keeps the largest channel of the flux, whatever surfaces do to it."""
     flux = arrays(source_of(gi.scenes.cornell_box()).shoot(5000, 0))[2]
@@ -237,7 +262,8 @@ def metric2(points, x, n, stretch):
 @pytest.mark.parametrize("limit", [np.inf, 0.3])
 @pytest.mark.parametrize("guess", [0.0, 1e-6, 100.0])
 def test_search_equals_brute_force(limit, guess):
-    """k nearest, all within a radius, and the nearest: as by looking at every photon, with normals and plane heeded."""
+    """k nearest, all within a radius, and the nearest that reaches the point: as by looking at every photon, with
+    normals and plane heeded."""
     scene, _ = leak(thickness=0.01)
     source = source_of(scene)
     shot = source.shoot(1000, 0)
@@ -252,14 +278,23 @@ def test_search_equals_brute_force(limit, guess):
     device = source.device
     found, near = (device.zeros(count, vec8) for _ in range(2))
     place = device.zeros(count, int)
-    inputs = [tree.struct, device.array(x, wp.vec3), device.array(n, wp.vec3), k, guess, limit2, stretch, facing]
-    device.launch(search, count, inputs, [found, near, place])
-    order = tree.order.numpy()
+    covers, reach2 = source.tree(shot, np.arange(shot.count, dtype=np.int32)), rng.uniform(0.0, 0.2, shot.count)
+    covers._set_radii(device.array(reach2[covers.order.numpy()], float), 1)
+    covers.refit(balls=True)
+    points = [device.array(x, wp.vec3), device.array(n, wp.vec3)]
+    device.launch(
+        search, count, [tree.struct, covers.struct, *points, k, guess, limit2, stretch, facing], [found, near, place]
+    )
+    order, place = covers.order.numpy(), place.numpy()
+    assert 0.1 < (place >= 0).mean() < 1.0
     for i in range(count):
         m2 = metric2(position, x[i].astype(np.float64), n[i].astype(np.float64), stretch)
         taken = np.flatnonzero(normal @ n[i] > facing)
-        assert order[place.numpy()[i]] in taken
-        assert m2[order[place.numpy()[i]]] == pytest.approx(m2[taken].min(), rel=1e-5, abs=1e-12)
+        covering = taken[m2[taken] <= reach2[taken]]
+        if place[i] < 0:
+            assert len(covering) == 0
+        else:
+            assert m2[order[place[i]]] == pytest.approx(m2[covering].min(), rel=1e-5, abs=1e-12)
         taken = taken[(m2[taken] > 0.0) & (m2[taken] < limit2)]
         taken = taken[np.argsort(m2[taken])]
         sums, h2 = flux[taken[: k - 1]].sum(axis=0), m2[taken[k - 1]] if len(taken) >= k else limit2
@@ -281,7 +316,7 @@ def test_radii_equal_scipys(k):
     x, n = arrays(shot)[0][:300] + np.float32(1e-3), arrays(shot)[1][:300]
     device = source.device
     found, near, place = device.zeros(300, vec8), device.zeros(300, vec8), device.zeros(300, int)
-    inputs = [tree.struct, device.array(x, wp.vec3), device.array(n, wp.vec3), k, 0.0, 1e30, 0.0, -2.0]
+    inputs = [tree.struct, tree.struct, device.array(x, wp.vec3), device.array(n, wp.vec3), k, 0.0, 1e30, 0.0, -2.0]
     device.launch(search, 300, inputs, [found, near, place])
     expected = cKDTree(arrays(shot)[0]).query(x, k=k)[0][:, -1]
     np.testing.assert_allclose(np.sqrt(found.numpy()[:, 3]), expected, rtol=1e-5)

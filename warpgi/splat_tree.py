@@ -88,11 +88,13 @@ class SplatTree:
             child = LANES * np.arange(size, dtype=np.int32)
             self._first[start : start + size] = -1 - child if level == 0 else self.levels[level - 1][0] + child
 
-    def refit(self) -> None:
-        """Boxes from the splats' present sizes, level by level."""
+    def refit(self, balls: bool = False) -> None:
+        """Boxes from the splats' present sizes, as discs or as balls, level by level."""
         start, size = self.levels[0]
         blocks, nodes = self.struct.blocks, self.struct.nodes
-        self.device.launch(bvh.fit_leaves, size, [blocks, self.block_count, start, self.noise], [nodes])
+        self.device.launch(
+            bvh.fit_leaves, size, [blocks, self.block_count, start, self.noise, float(not balls)], [nodes]
+        )
         for (start, size), (below, count_below) in zip(self.levels[1:], self.levels, strict=False):
             self.device.launch(bvh.fit_level, size, [start, below, count_below], [nodes])
 
