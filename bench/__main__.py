@@ -93,6 +93,27 @@ def figures_command(
     figures.side_by_side(out, scene, methods, size, spp, rays, reference_spp, exposure, device)
 
 
+def lens_command(
+    out: Path,
+    size: tuple[int, int] = (640, 360),
+    rays: int = 192,
+    reference_spp: int = 1024,
+    device: str | None = None,
+    json: Path | None = None,
+) -> None:
+    """Picture of defocus and motion: 1 spp of butterflies, both methods that reconstruct from it, and the reference.
+
+    Args:
+        out: PNG to write.
+        size: Width and height of each panel in pixels.
+        rays: Reconstruction rays per pixel.
+        reference_spp: Paths per pixel of the reference.
+        device: cpu, cuda, cuda:0, ...; a GPU if there is one.
+        json: File for the numbers.
+    """
+    figures.lens(out, size, rays, reference_spp, device, json)
+
+
 def chart_command(
     scene: tuple[str, ...] = ("cornell-box", "courtyard"),
     size: tuple[int, int] = (256, 256),
@@ -154,6 +175,7 @@ def main(arguments: list[str] | None = None) -> int:
     app.command(rays_command, name="rays")
     app.command(figures_command, name="figures")
     app.command(scaling_command, name="scaling")
+    app.command(lens_command, name="lens")
     app.command(chart_command, name="chart")
     app.command(stability_command, name="stability")
     try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from json import dumps
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from bench.mitsuba_peer import LLVM, require
 from bench.reference import make_reference
 from bench.report import progress
 from warpgi import checks
-from warpgi.image import check_output, write_png
+from warpgi.image import atomic_write, check_output, write_png
 from warpgi.methods import RECONSTRUCTIONS, Method
 from warpgi.reconstruction import pixel_means
 
@@ -125,3 +126,36 @@ def panels_of_mitsuba(
     ]
     reference = np.mean(pictures, axis=0)
     return panels | {"reference": reference}, [gi.compare(panel, reference) for panel in panels.values()]
+
+
+def lens(
+    out: Path, size: tuple[int, int], rays: int, reference_spp: int, device: str | None, json: Path | None
+) -> None:
+    """Defocus and motion of the butterflies: the input of 1 spp, the earlier method, reconstruction, the reference."""
+    check_output(out)
+    checks.count("reference_spp", reference_spp)
+    scene = gi.scenes.butterflies()
+    methods = {
+        "input": gi.PathTracing(spp=1),
+        "temporal light field": gi.TemporalLightField(spp=1, rays=rays),
+        "light field": gi.LightField(spp=1, rays=rays, neighbours=8, primary_rays=True),
+        "reference": gi.PathTracing(spp=reference_spp),
+    }
+    # the same input for all; the reference's paths are others
+    renders = [gi.render(scene, method, size, name == "reference", device, True) for name, method in methods.items()]
+    numbers: dict[str, Any] = {}
+    for name, render in zip(methods, renders[:3], strict=False):
+        errors = gi.compare(render.image, renders[3].image)
+        energy = float(render.image.mean(dtype=np.float64) / renders[3].image.mean(dtype=np.float64))
+        numbers[name] = errors | {"energy": energy, "seconds": sum(render.timings.values())}
+        print(
+            f"{name}: {', '.join(f'{kind} {value:.4g}' for kind, value in numbers[name].items() if value is not None)}"
+        )
+    if json is not None:
+        about = {"size": size, "rays": rays, "reference_spp": reference_spp, "methods": numbers}
+        with atomic_write(json) as file:
+            file.write_text(dumps(about, indent=1))
+    gap = np.full((size[1], GAP, 3), WHITE, np.float32)
+    rows = [np.concatenate([renders[i].image, gap, renders[i + 1].image], axis=1) for i in (0, 2)]
+    write_png(out, np.concatenate([rows[0], np.full((GAP, *rows[0].shape[1:]), WHITE, np.float32), rows[1]]))
+    print(f"wrote {out}")

@@ -14,9 +14,18 @@ from warpgi.kernels.sampling import (
     square_to_cosine_hemisphere,
     to_world,
 )
-from warpgi.kernels.scene import CONDUCTOR, DIELECTRIC, DIFFUSE, MIRROR, ShapeRecord
+from warpgi.kernels.scene import COATED, CONDUCTOR, DIELECTRIC, DIFFUSE, MIRROR, ShapeRecord
 
 wp.set_module_options({"enable_backward": False})
+
+
+# Layers of Coated.
+BASE = wp.constant(0)
+COAT = wp.constant(1)
+
+
+# Stands for the exponent of a lobe without width, where one is asked for.
+DELTA_EXPONENT = wp.constant(1.0e6)
 
 
 @wp.struct
@@ -26,11 +35,22 @@ class BsdfSample:
     pdf: float  # per solid angle; 0 for a delta lobe
     transmitted: int  # 1: it went through the surface
     eta: float  # index of refraction crossed, 1 for reflection
+    layer: int  # of Coated: COAT or BASE, the one that was drawn from
 
 
 @wp.func
 def is_delta(kind: int):
     return kind == MIRROR or kind == DIELECTRIC
+
+
+@wp.func
+def bandwidth(shape: ShapeRecord):
+    """Blinn exponent of the sharpest lobe, 0 where all is diffuse: LALD12's kappa is four times its square root."""
+    if is_delta(shape.kind):
+        return DELTA_EXPONENT
+    if shape.kind == DIFFUSE:
+        return 0.0
+    return shape.exponent
 
 
 @wp.func
@@ -82,6 +102,82 @@ def fresnel_dielectric(cos_i: float, eta: float):
 
 
 @wp.func
+def glossy_lobe(shape: ShapeRecord, n: wp.vec3, wo: wp.vec3, wi: wp.vec3, h: wp.vec3, oh: float):
+    """D G / (4 cos_o) of Torrance-Sparrow with the Blinn distribution, the cosine of wi cancelled."""
+    cos_o = wp.dot(n, wo)
+    cos_h = wp.dot(n, h)
+    d = (shape.exponent + 2.0) * 0.5 * INV_PI * wp.pow(wp.max(cos_h, 0.0), shape.exponent)
+    g = wp.min(1.0, wp.min(2.0 * cos_h * cos_o / oh, 2.0 * cos_h * wp.dot(n, wi) / oh))
+    return d * g / (4.0 * cos_o)
+
+
+@wp.func
+def glossy_pdf(shape: ShapeRecord, n: wp.vec3, wo: wp.vec3, wi: wp.vec3):
+    """Density of a direction drawn by the Blinn distribution's half vectors."""
+    h = wp.normalize(wo + wi)
+    cos_h = wp.max(wp.dot(n, h), 0.0)
+    return (shape.exponent + 1.0) * wp.pow(cos_h, shape.exponent) / (8.0 * PI * wp.max(wp.dot(wo, h), 1.0e-12))
+
+
+@wp.func
+def coat_albedo(shape: ShapeRecord, cos: float):
+    """Bound of the share of light from this angle that the coat of Coated reflects: see `warpgi.coat`."""
+    m = 1.0 - cos
+    m2 = m * m
+    m5 = m2 * m2 * m
+    m10 = m5 * m5
+    fit = shape.eta[0] + shape.eta[1] * m + shape.eta[2] * m2
+    fit = fit + shape.k[0] * m5 + shape.k[1] * m10 + shape.k[2] * (m10 * m10 * m2 * m2)
+    return wp.min(wp.min(fit, fresnel_dielectric(cos, shape.ior) + shape.coat[0]), 1.0)
+
+
+@wp.func
+def coat_value(shape: ShapeRecord, n: wp.vec3, wo: wp.vec3, wi: wp.vec3):
+    """f cos of the coat of Coated alone; both directions on the side of n."""
+    h = wp.normalize(wo + wi)
+    oh = wp.max(wp.dot(wo, h), 1.0e-12)
+    return fresnel_dielectric(oh, shape.ior) * glossy_lobe(shape, n, wo, wi, h, oh)
+
+
+@wp.func
+def base_albedo(shape: ShapeRecord, albedo: wp.vec3):
+    """What the base of Coated reflects of light that got through the coat, thrown back and forth below it included."""
+    r = shape.coat[2]
+    return wp.vec3(
+        albedo[0] * (1.0 - r) / (1.0 - albedo[0] * r),
+        albedo[1] * (1.0 - r) / (1.0 - albedo[1] * r),
+        albedo[2] * (1.0 - r) / (1.0 - albedo[2] * r),
+    )
+
+
+@wp.func
+def base_value(shape: ShapeRecord, albedo: wp.vec3, n: wp.vec3, wo: wp.vec3, wi: wp.vec3):
+    """f cos of the base of Coated, seen through its coat; both directions on the side of n."""
+    cos_i = wp.dot(n, wi)
+    through = (1.0 - coat_albedo(shape, wp.dot(n, wo))) * (1.0 - coat_albedo(shape, cos_i)) * shape.coat[1]
+    return base_albedo(shape, albedo) * (through * cos_i * INV_PI)
+
+
+@wp.func
+def base_share(shape: ShapeRecord, albedo: wp.vec3, n: wp.vec3, wo: wp.vec3, wi: wp.vec3):
+    """Part of the light from wi that comes to wo by way of a diffuse layer."""
+    if shape.kind == DIFFUSE:
+        return wp.vec3(1.0)
+    if shape.kind != COATED or wp.dot(n, wi) <= 0.0:
+        return wp.vec3(0.0)
+    base = base_value(shape, albedo, n, wo, wi)
+    coat = wp.max(coat_value(shape, n, wo, wi), 1.0e-30)
+    return wp.cw_div(base, base + wp.vec3(coat))
+
+
+@wp.func
+def coat_probability(shape: ShapeRecord, cos_o: float):
+    """Chance that the coat of Coated is sampled, as if its base reflected half of what it gets."""
+    e = coat_albedo(shape, cos_o)
+    return e / (e + 0.5 * (1.0 - e))
+
+
+@wp.func
 def evaluate(shape: ShapeRecord, albedo: wp.vec3, n: wp.vec3, wo: wp.vec3, wi: wp.vec3):
     """f(wo, wi) cos(wi) [1/sr]; 0 for delta lobes, which no given direction meets."""
     cos_o = wp.dot(n, wo)
@@ -91,13 +187,11 @@ def evaluate(shape: ShapeRecord, albedo: wp.vec3, n: wp.vec3, wo: wp.vec3, wi: w
     if shape.kind == DIFFUSE:
         return albedo * (cos_i * INV_PI)
     if shape.kind == CONDUCTOR:
-        # Torrance-Sparrow, Blinn distribution: F D G / (4 cos_o), the cosine of wi cancelled
         h = wp.normalize(wo + wi)
-        cos_h = wp.dot(n, h)
         oh = wp.max(wp.dot(wo, h), 1.0e-12)
-        d = (shape.exponent + 2.0) * 0.5 * INV_PI * wp.pow(wp.max(cos_h, 0.0), shape.exponent)
-        g = wp.min(1.0, wp.min(2.0 * cos_h * cos_o / oh, 2.0 * cos_h * cos_i / oh))
-        return conductor_reflectance(shape, albedo, oh) * (d * g / (4.0 * cos_o))
+        return conductor_reflectance(shape, albedo, oh) * glossy_lobe(shape, n, wo, wi, h, oh)
+    if shape.kind == COATED:
+        return base_value(shape, albedo, n, wo, wi) + wp.vec3(coat_value(shape, n, wo, wi))
     return wp.vec3(0.0)
 
 
@@ -110,9 +204,10 @@ def pdf(shape: ShapeRecord, n: wp.vec3, wo: wp.vec3, wi: wp.vec3):
     if shape.kind == DIFFUSE:
         return cos_i * INV_PI
     if shape.kind == CONDUCTOR:
-        h = wp.normalize(wo + wi)
-        cos_h = wp.max(wp.dot(n, h), 0.0)
-        return (shape.exponent + 1.0) * wp.pow(cos_h, shape.exponent) / (8.0 * PI * wp.max(wp.dot(wo, h), 1.0e-12))
+        return glossy_pdf(shape, n, wo, wi)
+    if shape.kind == COATED:
+        chance = coat_probability(shape, wp.dot(n, wo))
+        return chance * glossy_pdf(shape, n, wo, wi) + (1.0 - chance) * cos_i * INV_PI
     return 0.0
 
 
@@ -150,6 +245,21 @@ def sample(shape: ShapeRecord, albedo: wp.vec3, n: wp.vec3, wo: wp.vec3, u: wp.v
         s.pdf = local[2] * INV_PI
         if s.pdf > 0.0:
             s.weight = albedo
+    elif shape.kind == COATED:
+        chance = coat_probability(shape, wp.dot(n, wo))
+        if u[0] < chance:
+            s.layer = COAT
+            h = to_world(make_frame(n), square_to_blinn_half_vector(wp.vec2(u[0] / chance, u[1]), shape.exponent))
+            oh = wp.dot(wo, h)
+            if oh > 0.0:
+                s.wi = h * (2.0 * oh) - wo
+                s.pdf = pdf(shape, n, wo, s.wi)
+        else:
+            rest = wp.vec2((u[0] - chance) / (1.0 - chance), u[1])
+            s.wi = to_world(make_frame(n), square_to_cosine_hemisphere(rest))
+            s.pdf = pdf(shape, n, wo, s.wi)
+        if s.pdf > 0.0:
+            s.weight = evaluate(shape, albedo, n, wo, s.wi) / s.pdf
     elif shape.kind == CONDUCTOR:
         h = to_world(make_frame(n), square_to_blinn_half_vector(u, shape.exponent))
         oh = wp.dot(wo, h)

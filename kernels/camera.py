@@ -17,6 +17,8 @@ class Camera:
     tan_y: float
     lens_radius: float
     focus_distance: float
+    shutter_open: float  # scene time
+    shutter_length: float
     width: int
     height: int
 
@@ -42,3 +44,9 @@ def camera_ray(camera: Camera, x: float, y: float, lens: wp.vec2):
         d = d * camera.focus_distance - shift
     ray.d = wp.normalize(d)
     return ray
+
+
+@wp.func
+def shutter_time(camera: Camera, u: float):
+    """Scene time at the part u of the shutter's interval."""
+    return camera.shutter_open + camera.shutter_length * u

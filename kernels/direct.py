@@ -17,6 +17,7 @@ SHADOW_SHORTER = wp.constant(0.999999)
 @wp.struct
 class DirectLight:
     radiance: wp.vec3  # reflected towards wo
+    wi: wp.vec3  # towards the light
     shadow_rays: int
 
 
@@ -29,12 +30,18 @@ def emitted(shape: ShapeRecord, ng: wp.vec3, wo: wp.vec3):
 
 
 @wp.func
-def emission_weight(shape: ShapeRecord, ng: wp.vec3, d: wp.vec3, distance: float, bsdf_pdf: float):
-    """Weight of emission met by a ray that BSDF sampling sent along d; `bsdf_pdf` is 0 after a delta lobe."""
-    if bsdf_pdf <= 0.0 or shape.light_pdf <= 0.0:
+def found_light_weight(pdf_area: float, ng: wp.vec3, d: wp.vec3, distance: float, bsdf_pdf: float):
+    """Weight of emission met by a ray that BSDF sampling sent along d, where light sampling picks with `pdf_area`."""
+    if bsdf_pdf <= 0.0 or pdf_area <= 0.0:
         return 1.0
-    light_pdf = area_to_solid_angle(shape.light_pdf, distance * distance, wp.abs(wp.dot(ng, d)))
+    light_pdf = area_to_solid_angle(pdf_area, distance * distance, wp.abs(wp.dot(ng, d)))
     return power_heuristic(bsdf_pdf, light_pdf)
+
+
+@wp.func
+def emission_weight(shape: ShapeRecord, ng: wp.vec3, d: wp.vec3, distance: float, bsdf_pdf: float):
+    """The same on a shape that is still; `bsdf_pdf` is 0 after a delta lobe."""
+    return found_light_weight(shape.light_pdf, ng, d, distance, bsdf_pdf)
 
 
 @wp.func
@@ -63,6 +70,7 @@ def direct_light(
     result = DirectLight()
     result.radiance = wp.vec3(0.0)
     light = sample_light(scene, s.p, u, choice)
+    result.wi = light.wi
     if light.weight[0] + light.weight[1] + light.weight[2] <= 0.0 or not reflects(s, wo, light.wi):
         return result
     f = evaluate(shape, s.albedo, n, wo, light.wi)

@@ -40,6 +40,9 @@ class PathSample:
     depth: float  # distance along the camera ray, below 0: nothing was met
     has_ray: int  # 1: a ray went on from the first hit
     inverse_distance: float  # one over its length, 0: it met nothing
+    bandwidth: float  # Blinn exponent of what was met first, 0: diffuse
+    motion: wp.vec3  # how far that point goes from time 0 to 1
+    base: wp.vec3  # part of direct and indirect light that left it by way of a diffuse layer
     closest_hit_rays: int
     shadow_rays: int
 

@@ -3,7 +3,7 @@
 import warp as wp
 
 from warpgi.kernels.sampling import square_to_triangle
-from warpgi.kernels.scene import Scene, ray_offset
+from warpgi.kernels.scene import Scene, ray_offset, triangle_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -52,25 +52,23 @@ def sample_light(scene: Scene, p: wp.vec3, u: wp.vec2, choice: float):
     s = LightSample()
     s.weight = wp.vec3(0.0)
     if light.face >= 0:
-        a = scene.points[scene.indices[3 * light.face]]
-        b = scene.points[scene.indices[3 * light.face + 1]]
-        c = scene.points[scene.indices[3 * light.face + 2]]
+        face = triangle_at(scene, light.face)
         bary = square_to_triangle(u)
-        q = a * bary[0] + b * bary[1] + c * bary[2]
+        q = face.a * bary[0] + face.b * bary[1] + face.c * bary[2]
         to_light = q - p
         distance2 = wp.dot(to_light, to_light)
         if distance2 > 0.0:
             s.wi = to_light / wp.sqrt(distance2)
-            n = scene.face_normals[light.face]
+            n = face.ng
             shape = scene.shapes[scene.face_shapes[light.face]]
             cos_light = -wp.dot(n, s.wi)
             if cos_light < 0.0 and shape.two_sided != 0:
                 cos_light = -cos_light
                 n = -n
             if cos_light > 0.0:
-                s.pdf = area_to_solid_angle(shape.light_pdf, distance2, cos_light)
+                s.pdf = area_to_solid_angle(shape.light_pdf * face.stretch, distance2, cos_light)
                 s.weight = shape.emission / s.pdf
-                s.target = q + n * ray_offset(a, b, c)
+                s.target = q + n * ray_offset(face.a, face.b, face.c)
         return s
     probability = light_probability(scene, index)
     if light.distant != 0:

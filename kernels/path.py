@@ -2,25 +2,26 @@
 
 import warp as wp
 
-from warpgi.kernels.bsdf import is_delta, sample
-from warpgi.kernels.camera import Camera, camera_ray
+from warpgi.kernels.bsdf import bandwidth, base_share, is_delta, sample
+from warpgi.kernels.camera import Camera, camera_ray, shutter_time
 from warpgi.kernels.direct import (
     add_features,
     direct_light,
-    emission_weight,
     emitted,
     facing_normal,
+    found_light_weight,
     reflects,
 )
 from warpgi.kernels.film import Film, PathSample, add_sample
 from warpgi.kernels.rng import Sampler, make_sampler, sample_2d
-from warpgi.kernels.scene import DIELECTRIC, Scene, closest_hit, offset_origin, surface_at
+from warpgi.kernels.scene import DIELECTRIC, Scene, closest_hit, motion_at, offset_origin, surface_at
 
 wp.set_module_options({"enable_backward": False})
 
 # Pairs of random numbers: two for the camera, then three for each vertex.
 CAMERA_PAIRS = wp.constant(2)
 VERTEX_PAIRS = wp.constant(3)
+TIME_PAIR = wp.constant(-1)  # beside these, so that a still scene's numbers do not depend on it
 
 # Even a path that loses nothing ends some day.
 MAX_SURVIVAL = wp.constant(0.95)
@@ -75,6 +76,8 @@ def trace_path(
     throughput = wp.vec3(1.0)
     bsdf_pdf = first_pdf  # of the direction d; 0: from the camera or a delta lobe
     eta_scale = float(1.0)  # product of crossed indices squared, which roulette must not mistake for loss
+    share = wp.vec3(1.0)  # of the light after the first vertex that left it by way of a diffuse layer
+    before = wp.vec3(0.0)  # what came to it straight from lights
     depth = int(1)
     while True:
         hit = closest_hit(scene, o, d)
@@ -88,13 +91,16 @@ def trace_path(
         wo = -d
         if depth == 1:
             path = add_features(path, s, wo, hit.t)
+            path.bandwidth = bandwidth(shape)
+            if scene.moving != 0:
+                path.motion = motion_at(scene, hit)
         elif depth == 2:
             path.inverse_distance = inverse_distance(hit.t)
 
         # emission
         le = emitted(shape, s.ng, wo)
         if le[0] + le[1] + le[2] > 0.0:
-            w = emission_weight(shape, s.ng, d, hit.t, bsdf_pdf)
+            w = found_light_weight(shape.light_pdf * s.stretch, s.ng, d, hit.t, bsdf_pdf)
             path = add_light(path, depth, wp.cw_mul(throughput, le) * w)
         last = depth + 1 >= settings.max_depth
         if depth >= settings.max_depth:
@@ -110,6 +116,9 @@ def trace_path(
             light = direct_light(scene, shape, s, n, wo, sample_2d(sampler, pair), extra[0], 1.0)
             path.shadow_rays = path.shadow_rays + light.shadow_rays
             path = add_light(path, depth + 1, wp.cw_mul(throughput, light.radiance))
+            if depth == 1:
+                before = light.radiance
+                path.base = wp.cw_mul(before, base_share(shape, s.albedo, n, wo, light.wi))
         if last and scene.visible_light == 0:
             break  # nothing but a light could still be met, and there is none to meet
 
@@ -119,6 +128,8 @@ def trace_path(
             break
         if b.transmitted == 0 and not reflects(s, wo, b.wi):
             break  # a shading normal sent it through the surface
+        if depth == 1:
+            share = base_share(shape, s.albedo, n, wo, b.wi)
         throughput = wp.cw_mul(throughput, b.weight)
         eta_scale = eta_scale * b.eta * b.eta
         bsdf_pdf = b.pdf
@@ -133,6 +144,7 @@ def trace_path(
         d = b.wi
         depth = depth + 1
         path.has_ray = 1
+    path.base = path.base + wp.cw_mul(share, path.direct + path.indirect - before)
     return path
 
 
@@ -144,6 +156,12 @@ def pixel_ray(camera: Camera, sampler: Sampler, pixel: int):
     if camera.lens_radius > 0.0:
         lens = sample_2d(sampler, 1)
     return camera_ray(camera, float(pixel % camera.width) + u[0], float(pixel // camera.width) + u[1], lens)
+
+
+@wp.func
+def shutter_part(sampler: Sampler):
+    """A random part of the shutter's interval, in [0, 1)."""
+    return sample_2d(sampler, TIME_PAIR)[0]
 
 
 @wp.kernel
@@ -162,4 +180,6 @@ def trace_paths(
     for index in range(first_sample, first_sample + sample_count):
         sampler = make_sampler(settings.seed, pixel, index, settings.sampler)
         ray = pixel_ray(camera, sampler, pixel)
+        if scene.moving != 0:
+            scene.time = shutter_time(camera, shutter_part(sampler))
         add_sample(film, i, trace_path(scene, settings, sampler, CAMERA_PAIRS, ray.o, ray.d, 0.0))

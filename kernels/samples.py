@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from warpgi.kernels.bsdf import sample
-from warpgi.kernels.camera import Camera
+from warpgi.kernels.bsdf import COAT, is_delta, sample
+from warpgi.kernels.camera import Camera, shutter_time
 from warpgi.kernels.direct import add_features, direct_light, emitted, facing_normal, reflects
 from warpgi.kernels.film import Film, PathSample, add_sample
 from warpgi.kernels.path import (
@@ -13,16 +13,21 @@ from warpgi.kernels.path import (
     add_light,
     inverse_distance,
     pixel_ray,
+    shutter_part,
     trace_path,
 )
 from warpgi.kernels.rng import make_sampler, sample_2d
+from warpgi.kernels.sampling import square_to_disc
 from warpgi.kernels.scene import (
+    COATED,
     DIELECTRIC,
     DIFFUSE,
     FAR,
-    MIRROR,
+    Hit,
     Scene,
+    Surface,
     closest_hit,
+    motion_at,
     occluded,
     offset_origin,
     surface_at,
@@ -49,6 +54,44 @@ class SampleArrays:
     radiance: wp.array[wp.vec3]  # along the secondary ray, without emission
     throughput: wp.array[wp.vec3]  # albedo at the secondary hit; empty where nobody asked
     hit_direct: wp.array[wp.vec3]  # its direct light; empty likewise
+    # for scenes with a lens, or in motion; empty for others
+    lens: wp.array[wp.vec2]
+    time: wp.array[float]  # part of the shutter's interval
+    origin_motion: wp.array[wp.vec3]  # while the shutter is open
+    hit_motion: wp.array[wp.vec3]
+    # for glossy reconstruction; empty where nobody asked, and then surfaces that are not diffuse are not recorded
+    material: wp.array[int]  # number of the primary hit's shape
+    wo: wp.array[wp.vec3]  # from the primary hit towards what sees it
+    reflectance: wp.array[wp.vec3]  # its albedo; `albedo` is then what multiplies its BSDF
+    layer: wp.array[int]  # that the secondary ray was drawn from, COAT or BASE
+    bandwidth: wp.array[float]  # Blinn exponent at the secondary hit
+    base_radiance: wp.array[wp.vec3]  # part of the radiance that left the secondary hit by way of a diffuse layer
+
+
+@wp.func
+def record_receiver(
+    samples: SampleArrays,
+    scene: Scene,
+    camera: Camera,
+    hit: Hit,
+    s: Surface,
+    n: wp.vec3,
+    wo: wp.vec3,
+    place: int,
+    part: float,
+    albedo: wp.vec3,
+):
+    """A primary hit, where light is to be gathered; `albedo` is what multiplies it."""
+    samples.origin[place] = s.p
+    samples.origin_normal[place] = n
+    samples.albedo[place] = albedo
+    if samples.wo.shape[0] > 0:
+        samples.material[place] = scene.face_shapes[hit.face]
+        samples.wo[place] = wo
+        samples.reflectance[place] = s.albedo
+    if scene.moving != 0:
+        samples.time[place] = part
+        samples.origin_motion[place] = motion_at(scene, hit) * camera.shutter_length
 
 
 @wp.kernel
@@ -62,7 +105,8 @@ def trace_samples(
     samples: SampleArrays,
 ):
     """One thread owns one pixel: traces its paths, puts what reconstruction leaves alone into `film`, the rest into
-    `samples`. Surfaces that are not diffuse keep their path-traced light.
+    `samples`. Surfaces that are not diffuse keep their path-traced light, but glossy ones only where nobody asked for
+    them.
 
     `light_samples` shadow rays go out from each primary hit, for the noise of direct light stays in the picture.
     """
@@ -77,6 +121,11 @@ def trace_samples(
             samples.hit[k] = wp.vec3(NO_HIT)
         sampler = make_sampler(settings.seed, pixel, index, settings.sampler)
         ray = pixel_ray(camera, sampler, pixel)
+        part = shutter_part(sampler)
+        if samples.lens.shape[0] > 0:
+            samples.lens[place] = square_to_disc(sample_2d(sampler, 1))
+        if scene.moving != 0:
+            scene.time = shutter_time(camera, part)
         path = PathSample()
         path.depth = -1.0
         throughput = wp.vec3(1.0)
@@ -103,7 +152,8 @@ def trace_samples(
             n = s.n
             if shape.kind != DIELECTRIC:
                 n = facing_normal(s, wo)
-            delta = shape.kind == DIELECTRIC or shape.kind == MIRROR
+            delta = is_delta(shape.kind)
+            recorded = shape.kind == DIFFUSE or (samples.wo.shape[0] > 0 and not delta)
 
             # light sampling; alone in charge of lamps where no secondary ray looks for them
             has_ray = index < samples.spp or shape.kind != DIFFUSE
@@ -124,6 +174,11 @@ def trace_samples(
                     path.shadow_rays = path.shadow_rays + light.shadow_rays
                     path = add_light(path, depth + 1, wp.cw_mul(throughput, light.radiance) * light_share)
 
+            if recorded and shape.kind != DIFFUSE:
+                record_receiver(samples, scene, camera, hit, s, n, wo, place, part, throughput)
+                if index < samples.spp:
+                    samples.hit[k] = s.p  # a ray of no length, unless one is found below
+
             # the secondary ray
             b = sample(shape, s.albedo, n, wo, sample_2d(sampler, CAMERA_PAIRS + VERTEX_PAIRS * (depth - 1) + 1))
             if b.weight[0] + b.weight[1] + b.weight[2] <= 0.0:
@@ -138,9 +193,7 @@ def trace_samples(
                 depth = depth + 1
             elif not has_ray:
                 going = 0
-                samples.origin[place] = s.p
-                samples.origin_normal[place] = n
-                samples.albedo[place] = wp.cw_mul(throughput, b.weight)
+                record_receiver(samples, scene, camera, hit, s, n, wo, place, part, wp.cw_mul(throughput, b.weight))
                 if wp.max(scene.environment) > 0.0:
                     path.shadow_rays = path.shadow_rays + 1
                     if not occluded(scene, o, d, FAR):
@@ -149,6 +202,8 @@ def trace_samples(
                 going = 0
                 rest = settings
                 rest.max_depth = settings.max_depth - depth
+                if recorded and index >= samples.spp:
+                    rest.max_depth = 1  # for the lamps that it meets alone
                 gathered = trace_path(
                     scene, rest, sampler, CAMERA_PAIRS + VERTEX_PAIRS * depth, o, d, b.pdf * light_share
                 )
@@ -161,10 +216,17 @@ def trace_samples(
                 path = add_light(path, depth + 1, wp.cw_mul(weight, gathered.emission))
                 incident = gathered.direct + gathered.indirect
                 if shape.kind == DIFFUSE:
-                    samples.origin[place] = s.p
-                    samples.origin_normal[place] = n
-                    samples.albedo[place] = weight
+                    record_receiver(samples, scene, camera, hit, s, n, wo, place, part, weight)
+                if recorded and index < samples.spp:
                     samples.radiance[k] = incident
+                    if scene.moving != 0:
+                        samples.hit_motion[k] = gathered.motion * camera.shutter_length
+                    if samples.wo.shape[0] > 0:
+                        samples.layer[k] = wp.where(shape.kind == DIFFUSE, 0, COAT)
+                        if shape.kind == COATED:
+                            samples.layer[k] = b.layer
+                        samples.bandwidth[k] = gathered.bandwidth
+                        samples.base_radiance[k] = gathered.base
                     if gathered.depth >= 0.0:
                         samples.hit[k] = gathered.position
                         samples.hit_normal[k] = gathered.normal
@@ -173,6 +235,6 @@ def trace_samples(
                             samples.hit_direct[k] = gathered.direct
                     else:
                         samples.hit[k] = d * NO_HIT
-                else:
+                elif not recorded:
                     path = add_light(path, depth + 2, wp.cw_mul(weight, incident))
         add_sample(film, i, path)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warpgi.kernels.triangles import TriangleTree, walk
+from warpgi.kernels.triangles import TriangleTree, walk, walk_moving
 
 wp.set_module_options({"enable_backward": False})
 
@@ -10,6 +10,7 @@ DIFFUSE = wp.constant(0)
 CONDUCTOR = wp.constant(1)
 MIRROR = wp.constant(2)
 DIELECTRIC = wp.constant(3)
+COATED = wp.constant(4)
 
 FAR = wp.constant(1.0e38)
 
@@ -20,11 +21,12 @@ OFFSET_ULPS = wp.constant(32.0 * 5.9604645e-8)
 
 @wp.struct
 class ShapeRecord:
-    kind: int  # DIFFUSE, CONDUCTOR, MIRROR or DIELECTRIC
-    albedo: wp.vec3  # of Diffuse; the reflectance of Conductor and Mirror
+    kind: int  # DIFFUSE, CONDUCTOR, MIRROR, DIELECTRIC or COATED
+    albedo: wp.vec3  # of Diffuse and the base of Coated; the reflectance of Conductor and Mirror
     texture: int  # of the albedo, -1: none
-    eta: wp.vec3  # of a Conductor, 0: take Schlick's approximation
+    eta: wp.vec3  # of a Conductor, 0: take Schlick's approximation; of Coated the fit of its coat's albedo, with k
     k: wp.vec3
+    coat: wp.vec3  # of Coated: its excess over a smooth one, 1 / what it lets through, what it throws back inside
     exponent: float  # of the Blinn distribution
     ior: float
     emission: wp.vec3  # emitted radiance
@@ -67,6 +69,9 @@ class Scene:
     light_cdf: wp.array[float]  # running sum of the lights' shares of the power
     light_count: int
     environment: wp.vec3
+    moving: int  # 1: `motion` holds how far each point goes from time 0 to 1
+    motion: wp.array[wp.vec3]
+    time: float  # at which rays see the scene, in [0, 1]: a path sets it, on its own copy
     visible_light: int  # 1: a ray that is not aimed at a light can find one
 
 
@@ -85,11 +90,26 @@ class Surface:
     n: wp.vec3  # shading normal on the same side as ng
     albedo: wp.vec3
     offset: float  # distance from the plane at which a new ray starts
+    stretch: float  # area of the triangle in the scene's description over its area now, 1 where nothing moves
+
+
+@wp.struct
+class Triangle:
+    a: wp.vec3
+    b: wp.vec3
+    c: wp.vec3
+    ng: wp.vec3
+    stretch: float
+    moves: int
 
 
 @wp.func
 def closest_hit(scene: Scene, o: wp.vec3, d: wp.vec3):
-    found = walk(scene.tree, o, d, FAR, 0)
+    found = wp.vec4()
+    if scene.moving != 0:
+        found = walk_moving(scene.tree, o, d, FAR, 0, scene.time)
+    else:
+        found = walk(scene.tree, o, d, FAR, 0)
     h = Hit()
     h.t = found[0]
     h.u = found[1]
@@ -100,7 +120,59 @@ def closest_hit(scene: Scene, o: wp.vec3, d: wp.vec3):
 
 @wp.func
 def occluded(scene: Scene, o: wp.vec3, d: wp.vec3, distance: float):
-    return wp.cast(walk(scene.tree, o, d, distance, 1)[3], wp.int32) >= 0
+    found = wp.vec4()
+    if scene.moving != 0:
+        found = walk_moving(scene.tree, o, d, distance, 1, scene.time)
+    else:
+        found = walk(scene.tree, o, d, distance, 1)
+    return wp.cast(found[3], wp.int32) >= 0
+
+
+@wp.func
+def triangle_at(scene: Scene, face: int):
+    """Corners and normal of a triangle at the scene's time."""
+    i = scene.indices[3 * face]
+    j = scene.indices[3 * face + 1]
+    k = scene.indices[3 * face + 2]
+    t = Triangle()
+    t.a = scene.points[i]
+    t.b = scene.points[j]
+    t.c = scene.points[k]
+    t.ng = scene.face_normals[face]
+    t.stretch = 1.0
+    if scene.moving != 0:
+        u = scene.motion[i]
+        v = scene.motion[j]
+        w = scene.motion[k]
+        if wp.length_sq(u) + wp.length_sq(v) + wp.length_sq(w) > 0.0:
+            area = wp.length(wp.cross(t.b - t.a, t.c - t.a))
+            t.a = t.a + u * scene.time
+            t.b = t.b + v * scene.time
+            t.c = t.c + w * scene.time
+            n = wp.cross(t.b - t.a, t.c - t.a)
+            t.ng = wp.normalize(n)
+            t.stretch = area / wp.max(wp.length(n), 1.0e-30)
+            t.moves = 1
+    return t
+
+
+@wp.func
+def turned(n: wp.vec3, before: wp.vec3, after: wp.vec3):
+    """n after the least rotation that takes the unit vector `before` to `after` (Moeller, Hughes 1999)."""
+    axis = wp.cross(before, after)
+    c = wp.dot(before, after)
+    if c <= -0.999:
+        return -n
+    return n * c + wp.cross(axis, n) + axis * (wp.dot(axis, n) / (1.0 + c))
+
+
+@wp.func
+def motion_at(scene: Scene, h: Hit):
+    """How far the point of a hit goes from time 0 to 1."""
+    i = scene.indices[3 * h.face]
+    j = scene.indices[3 * h.face + 1]
+    k = scene.indices[3 * h.face + 2]
+    return scene.motion[i] * h.u + scene.motion[j] * h.v + scene.motion[k] * (1.0 - h.u - h.v)
 
 
 @wp.func
@@ -157,17 +229,18 @@ def surface_at(scene: Scene, h: Hit, shape: ShapeRecord):
     i = scene.indices[3 * h.face]
     j = scene.indices[3 * h.face + 1]
     k = scene.indices[3 * h.face + 2]
-    a = scene.points[i]
-    b = scene.points[j]
-    c = scene.points[k]
+    t = triangle_at(scene, h.face)
     w = 1.0 - h.u - h.v
     s = Surface()
-    s.p = a * h.u + b * h.v + c * w
-    s.ng = scene.face_normals[h.face]
-    s.offset = ray_offset(a, b, c)
+    s.p = t.a * h.u + t.b * h.v + t.c * w
+    s.ng = t.ng
+    s.stretch = t.stretch
+    s.offset = ray_offset(t.a, t.b, t.c)
     s.n = s.ng
     if shape.has_normals != 0:
         n = wp.normalize(scene.normals[i] * h.u + scene.normals[j] * h.v + scene.normals[k] * w)
+        if t.moves != 0:
+            n = turned(n, scene.face_normals[h.face], s.ng)
         side = wp.dot(n, s.ng)
         if side != 0.0:
             s.n = n * wp.sign(side)

@@ -2,7 +2,8 @@
 
 Both tests run over eight lanes in plain loops that a CPU's compiler turns into vector instructions and a GPU runs as
 they are. The triangle test is watertight (Woop, Benthin, Wald 2013) and the box test is conservative (Ize 2013), so
-that no ray slips through the edge between two triangles.
+that no ray slips through the edge between two triangles. Where something moves, boxes and corners are those at the
+ray's time, linear between their places at both ends of the shutter (Glassner 1988); a still scene has its own walk.
 """
 
 import warp as wp
@@ -25,8 +26,20 @@ class TriangleTree:
     nodes: wp.array[float]  # NODE_FLOATS a node; an unused child has an empty box
     children: wp.array[int]  # WIDTH a node: a node, or -1 - block
     blocks: wp.array[float]  # BLOCK_FLOATS a leaf; an unused triangle has no area
-    faces: wp.array[int]  # WIDTH a leaf: number of the triangle
+    faces: wp.array[int]  # WIDTH a leaf: number of the triangle, -1 where unused
+    node_motion: wp.array[float]  # of `nodes` and `blocks` from time 0 to 1; both empty where all is still
+    block_motion: wp.array[float]
 
+
+STILL_NODE = "const float* p = tree.nodes.data + (size_t)current * 48;"
+STILL_BLOCK = "const float* p = tree.blocks.data + (size_t)block * 72;"
+MOVING = """float p[{count}];
+            {{
+                const float* from = tree.{name}s.data + (size_t){index} * {count};
+                const float* shift = tree.{name}_motion.data + (size_t){index} * {count};
+                for (int k = 0; k < {count}; ++k)
+                    p[k] = from[k] + time * shift[k];
+            }}"""
 
 # Returns (t, u, v, bits of the face's number); the face is -1 where nothing is hit. With `any_hit` the first hit found
 # ends the walk, and t, u, v are not of the nearest.
@@ -57,7 +70,9 @@ WALK = (
     int best_face = -1;
     while (true) {
         if (current >= 0) {
-            const float* p = tree.nodes.data + (size_t)current * 48;
+            """
+    + STILL_NODE
+    + """
             const int* kids = tree.children.data + (size_t)current * 8;
             float near[8];
             int met[8];
@@ -84,7 +99,9 @@ WALK = (
             }
         } else {
             const int block = -1 - current;
-            const float* p = tree.blocks.data + (size_t)block * 72;
+            """
+    + STILL_BLOCK
+    + """
             const float *ax_ = p + kx * 8, *ay_ = p + ky * 8, *az_ = p + kz * 8;
             float t[8], u[8], v[8];
             int met[8];
@@ -136,3 +153,12 @@ done:
 
 @wp.func_native(WALK)
 def walk(tree: TriangleTree, o: wp.vec3, d: wp.vec3, t_max: float, any_hit: int) -> wp.vec4: ...
+
+
+WALK_MOVING = WALK.replace(STILL_NODE, MOVING.format(name="node", index="current", count=48)).replace(
+    STILL_BLOCK, MOVING.format(name="block", index="block", count=72)
+)
+
+
+@wp.func_native(WALK_MOVING)
+def walk_moving(tree: TriangleTree, o: wp.vec3, d: wp.vec3, t_max: float, any_hit: int, time: float) -> wp.vec4: ...

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from warpgi.scene import Scene
+from warpgi.scenes.butterflies import butterflies
 from warpgi.scenes.caustic import caustic
 from warpgi.scenes.cornell import cornell_box, cornell_spheres
 from warpgi.scenes.courtyard import courtyard
@@ -25,11 +26,13 @@ SCENES: dict[str, Callable[..., Any]] = {
     "courtyard": courtyard,
     "caustic": caustic,
     "leak": leak,
+    "butterflies": butterflies,
 }
 __all__ = [
     "SCENES",
     "Expected",
     "build",
+    "butterflies",
     "caustic",
     "cornell_box",
     "cornell_spheres",

@@ -6,13 +6,19 @@ import dataclasses
 
 import numpy as np
 import pytest
+import warp as wp
 from noise import Z_LIMIT
 from scipy import stats
 
 import warpgi as gi
+from warpgi.coat import POWERS, fit_coat, fresnel
 from warpgi.device_scene import DeviceScene
+from warpgi.kernels import bsdf
+from warpgi.kernels.scene import ShapeRecord
 from warpgi.reconstruction import pixel_means
 from warpgi.samples import NO_HIT, REQUIRED
+
+wp.set_module_options({"enable_backward": False})
 
 SEEDS = 8
 
@@ -209,3 +215,126 @@ def test_wrong_arguments_are_refused(arguments, message):
     assert "\n" not in str(error.value)
     with pytest.raises(TypeError, match="scene is str, expected Scene"):
         gi.sample("cornell-box")
+
+
+def flat(material, height=0.0, size=1.0, flip=False):
+    corners = [(-size, height, -size), (-size, height, size), (size, height, size), (size, height, -size)]
+    faces = [(0, 2, 1), (0, 3, 2)] if flip else [(0, 1, 2), (0, 2, 3)]
+    return gi.Shape(corners, faces, material)
+
+
+def glossy_room(floor, ceiling):
+    """A floor seen from the side, under a ceiling that a light from below lights."""
+    lights = [gi.PointLight((0.3, 0.5, -0.2), (2.0, 1.5, 1.0))]
+    camera = gi.Camera((0.0, 0.6, 1.6), (0.0, 0.0, 0.0), fov=40)
+    return gi.Scene([flat(floor), flat(ceiling, 1.0, 4.0, flip=True)], camera, lights)
+
+
+@wp.kernel
+def bsdf_weights(
+    shapes: wp.array[ShapeRecord],
+    material: wp.array[int],
+    albedo: wp.array[wp.vec3],
+    n: wp.array[wp.vec3],
+    wo: wp.array[wp.vec3],
+    wi: wp.array[wp.vec3],
+    weight: wp.array[wp.vec3],
+):
+    i = wp.tid()
+    shape = shapes[material[i]]
+    density = bsdf.pdf(shape, n[i], wo[i], wi[i])
+    if density > 0.0:
+        weight[i] = bsdf.evaluate(shape, albedo[i], n[i], wo[i], wi[i]) / density
+
+
+@pytest.mark.parametrize(
+    "material", [gi.Conductor(0.1, (0.9, 0.6, 0.4)), gi.Coated((0.6, 0.3, 0.2), 0.05), gi.Diffuse(0.6)]
+)
+def test_glossy_samples_hold_what_their_bsdf_needs(material):
+    """BSDF over pdf from material, normal, wo, reflectance and ray alone, times radiance, is path tracing's indirect.
+
+    A ray that was absorbed is one of no length, which counts as black.
+    """
+    scene, size = glossy_room(material, gi.Diffuse((0.8, 0.7, 0.6))), (16, 16)
+    shapes = DeviceScene(scene, gi.Device("cpu"))
+    ours = []
+    for seed in range(SEEDS):
+        samples = gi.sample(scene, spp=32, size=size, seed=seed, glossy=True)
+        if isinstance(material, gi.Diffuse):
+            assert samples.wo is None and samples.materials == ()
+            ours.append(blocks(pixel_means(samples, samples.albedo * samples.radiance)))
+            continue
+        assert samples.materials == (material, scene.shapes[1].material)
+        sent = samples.checked.is_primary & (samples.checked.is_splat | samples.checked.is_escaped)
+        vectors = (samples.reflectance, samples.origin_normal, samples.wo, samples.direction)
+        inputs = [wp.array(x, dtype=wp.vec3, device="cpu") for x in vectors]
+        weight = wp.zeros(len(samples), dtype=wp.vec3, device="cpu")
+        records = [shapes.struct.shapes, wp.array(samples.material, dtype=int, device="cpu")]
+        wp.launch(bsdf_weights, len(samples), inputs=[*records, *inputs], outputs=[weight], device="cpu")
+        diffuse = (samples.material == 1)[:, None]
+        value = np.where(diffuse, samples.albedo, samples.albedo * weight.numpy()) * samples.radiance
+        ours.append(blocks(pixel_means(samples, np.where(sent[:, None], value, np.float32(0.0)))))
+    assert largest_t(ours, [blocks(x) for x in traced(scene, "indirect", size, spp=64)]) < Z_LIMIT
+
+
+def test_bandwidth_and_layers_of_secondary_hits():
+    """Light that leaves a diffuse hit is all of its base, a metal's none, a coat's shared out as its layers reflect.
+
+    The coat without contrast to air adds nothing, one over black is all there is; the exponent is 1 / roughness.
+    """
+    floor = gi.Coated((0.5, 0.5, 0.5), 0.2)  # makes the scene glossy, whatever hangs over it
+    found = {}
+    ceilings = {
+        "diffuse": gi.Diffuse(0.7),
+        "metal": gi.Conductor(0.05),
+        "coated": gi.Coated(0.5, 0.05),
+        "bare": gi.Coated(0.5, 0.05, ior=1.0),
+        "black": gi.Coated(0.0, 0.05),
+        "mirror": gi.Mirror(0.8),
+    }
+    for name, ceiling in ceilings.items():
+        samples = gi.sample(glossy_room(floor, ceiling), spp=8, size=(16, 16), glossy=True)
+        up = samples.checked.is_splat & (samples.material == 0)
+        assert up.mean() > 0.3
+        found[name] = samples.radiance[up], samples.base_radiance[up], samples.kappa[up]
+    light, base, kappa = found["diffuse"]
+    np.testing.assert_array_equal(base, light)
+    assert (kappa == 0.0).all()
+    light, base, kappa = found["metal"]
+    np.testing.assert_array_equal(base, 0.0)
+    np.testing.assert_allclose(kappa, 4.0 * np.sqrt(20.0), rtol=1e-6)
+    light, base, kappa = found["coated"]
+    np.testing.assert_allclose(kappa, 4.0 * np.sqrt(20.0), rtol=1e-6)
+    assert (base <= light * (1 + 1e-6)).all() and (base >= 0.0).all()
+    assert 0.6 * light.mean() < base.mean() < 0.99 * light.mean()
+    np.testing.assert_allclose(found["bare"][1], found["bare"][0], rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(found["black"][1], 0.0, atol=1e-6)
+    assert found["black"][0].mean() > 0.0
+    np.testing.assert_array_equal(found["mirror"][1], 0.0)
+    assert (found["mirror"][2] > 1000.0).all()
+
+
+def test_a_coats_light_is_split_as_its_layers_reflect():
+    """With one light and no further bounce, base over whole is that of the two terms for the pair of directions."""
+    scene = glossy_room(gi.Coated(0.5, 0.2), gi.Coated(0.5, 0.3))
+    for seed in range(2):
+        one = gi.sample(scene, 16, (16, 16), seed, glossy=True, max_depth=3)
+        up = one.checked.is_splat & (one.material == 0) & (one.radiance > 0.0).all(axis=1)
+        light = np.array([0.3, 0.5, -0.2]) - one.hit[up]
+        wi = light / np.linalg.norm(light, axis=1, keepdims=True)
+        wo = -one.direction[up]
+        n = one.hit_normal[up].astype(np.float64)
+        h = wi + wo
+        h /= np.linalg.norm(h, axis=1, keepdims=True)
+        cos_i, cos_o, cos_h, oh = ((n * wi).sum(1), (n * wo).sum(1), (n * h).sum(1), (wo * h).sum(1))
+        e = 1.0 / 0.3
+        g = np.minimum(1.0, 2.0 * cos_h * np.minimum(cos_i, cos_o) / oh)
+        coat = fresnel(oh, 1.5) * (e + 2) / (2 * np.pi) * cos_h**e * g / (4.0 * cos_o)
+        fit = fit_coat(0.3, 1.5)
+        through = 1.0
+        for cos in (cos_i, cos_o):
+            bound = (1.0 - cos)[:, None] ** np.array(POWERS) @ fit.coefficients
+            through = through * (1.0 - np.minimum(bound, fresnel(cos, 1.5) + fit.excess))
+        r = fit.internal
+        base = 0.5 * (1.0 - r) / (1.0 - 0.5 * r) * through / fit.transmitted * cos_i / np.pi
+        np.testing.assert_allclose(one.base_radiance[up, 0] / one.radiance[up, 0], base / (base + coat), rtol=2e-3)

@@ -506,3 +506,18 @@ def test_primitives_face_where_they_say():
     assert (centre * normal * [1.0, 0.0, 1.0]).sum(axis=1).min() > 0.0
     turned = primitives.quad((0, 0, 0), (1, 0, 0), (0, 1, 0)).turn(0.5 * math.pi)
     assert np.allclose(turned.normals, [1.0, 0.0, 0.0])
+
+
+def test_butterflies_are_some_in_focus_and_some_far_out(scenes):
+    """Circles of confusion reach from below a pixel to more than five of a 360-line picture; three in four fly."""
+    scene = scenes["butterflies"]
+    camera = scene.camera
+    wings = [shape for shape in scene.shapes if shape.name.endswith("wings")]
+    depth = np.array([-shape.vertices[:, 2].mean() for shape in wings])
+    pixel = 2.0 * camera.focus_distance * np.tan(np.radians(camera.fov) / 2.0) / 360
+    radius = camera.lens_radius / pixel * np.abs(1.0 - camera.focus_distance / depth)
+    assert radius.min() < 1.0 and radius.max() > 5.0
+    assert sum(shape.motion is not None for shape in wings) == 18
+    assert all(shape.texture is not None for shape in wings)
+    still = build("butterflies", motion=0.0, aperture=0.0)
+    assert scene.moves and not still.moves

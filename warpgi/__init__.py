@@ -8,7 +8,7 @@ from warpgi.denoise import denoise
 from warpgi.device import Device
 from warpgi.lights import DistantLight, Environment, PointLight, SpotLight
 from warpgi.load import load_scene
-from warpgi.materials import Conductor, Dielectric, Diffuse, Emissive, Mirror, Texture
+from warpgi.materials import Coated, Conductor, Dielectric, Diffuse, Emissive, Mirror, Texture
 from warpgi.methods import (
     METHODS,
     AmbientOcclusion,
@@ -20,6 +20,7 @@ from warpgi.methods import (
     PhotonMap,
     RandomParameterFilter,
     Sampler,
+    TemporalLightField,
 )
 from warpgi.metrics import compare
 from warpgi.mitsuba_samples import sample_from_mitsuba
@@ -37,6 +38,7 @@ __all__ = [
     "ATrous",
     "AmbientOcclusion",
     "Camera",
+    "Coated",
     "Conductor",
     "Device",
     "Dielectric",
@@ -60,6 +62,7 @@ __all__ = [
     "Scene",
     "Shape",
     "SpotLight",
+    "TemporalLightField",
     "Texture",
     "compare",
     "denoise",

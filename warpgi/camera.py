@@ -1,4 +1,4 @@
-"""The camera: pinhole, or thin lens where `lens_radius` is above 0."""
+"""The camera: pinhole, or thin lens where `lens_radius` is above 0, with a shutter for scenes that move."""
 
 from __future__ import annotations
 
@@ -30,6 +30,8 @@ class Camera:
     """Radius of the thin lens in world units; 0 is a pinhole, where all is sharp."""
     focus_distance: float | None = None
     """Distance along the viewing direction of the plane that is sharp; None: the distance of `target`."""
+    shutter: tuple[float, float] = (0.0, 1.0)
+    """Scene time at which the shutter opens and closes, in [0, 1]; equal times are an instant."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "position", checks.vector("camera position", self.position))
@@ -39,6 +41,10 @@ class Camera:
         checks.number("camera lens_radius", self.lens_radius, 0.0)
         if self.focus_distance is not None:
             checks.number("camera focus_distance", self.focus_distance, 0.0, open_lower=True)
+        shutter = checks.finite_array("camera shutter", self.shutter, (2,))
+        if not 0.0 <= shutter[0] <= shutter[1] <= 1.0:
+            raise ValueError(f"camera shutter is {tuple(shutter.tolist())}, expected two ascending times in [0, 1]")
+        object.__setattr__(self, "shutter", tuple(shutter.tolist()))
         forward = np.subtract(self.target, self.position)
         if not forward.any():
             raise ValueError("camera target is the camera position, expected another point")

@@ -7,12 +7,13 @@ import hashlib
 import numpy as np
 import warp as wp
 
+from warpgi.coat import fit_coat
 from warpgi.device import Device
 from warpgi.kernels import camera as camera_kernels
 from warpgi.kernels import scene as kernels
 from warpgi.kernels import triangles as triangle_kernels
 from warpgi.lights import DistantLight, Environment, PointLight, SpotLight
-from warpgi.materials import Conductor, Dielectric, Diffuse, Material, Mirror, Texture
+from warpgi.materials import Coated, Conductor, Dielectric, Diffuse, Material, Mirror, Texture
 from warpgi.scene import Scene, Shape
 from warpgi.triangle_tree import build_triangle_tree
 
@@ -21,6 +22,7 @@ KINDS = {
     Conductor: kernels.CONDUCTOR,
     Mirror: kernels.MIRROR,
     Dielectric: kernels.DIELECTRIC,
+    Coated: kernels.COATED,
 }
 
 # Running sums of shares are float32: a light too weak for them would never be picked, so that each shape or light gets
@@ -63,6 +65,7 @@ class DeviceScene:
         result.lens_radius = camera.lens_radius
         distance = float(np.linalg.norm(np.subtract(camera.target, camera.position)))
         result.focus_distance = camera.focus_distance or distance
+        result.shutter_open, result.shutter_length = camera.shutter[0], camera.shutter[1] - camera.shutter[0]
         result.width, result.height = size
         return result
 
@@ -100,8 +103,16 @@ class DeviceScene:
         struct.face_shapes = self._upload(shape_of_face, int)
         struct.normals = self._upload(_per_vertex([s.normals for s in shapes], starts, 3), wp.vec3)
         struct.uvs = self._upload(_per_vertex([s.uv for s in shapes], starts, 2), wp.vec2)
+        struct.moving = int(self.scene.moves)
+        motion = None
+        if struct.moving:
+            still = [shape.motion is None for shape in shapes]
+            motion = np.concatenate(
+                [np.zeros_like(s.vertices) if none else s.motion for s, none in zip(shapes, still, strict=True)]
+            ).astype(np.float32)
+        struct.motion = self._upload(np.zeros((0, 3), np.float32) if motion is None else motion, wp.vec3)
         tree = triangle_kernels.TriangleTree()
-        for name, values in build_triangle_tree(points.astype(np.float32), faces).items():
+        for name, values in build_triangle_tree(points.astype(np.float32), faces, motion).items():
             setattr(tree, name, self._upload(values, float if values.dtype == np.float32 else int))
         struct.tree = tree
 
@@ -191,7 +202,7 @@ class DeviceScene:
         if isinstance(material, Dielectric):
             record.ior = material.ior
         else:
-            colour = material.albedo if isinstance(material, Diffuse) else material.reflectance
+            colour = material.albedo if isinstance(material, (Diffuse, Coated)) else material.reflectance
             if isinstance(colour, Texture):
                 record.albedo = wp.vec3(1.0)
                 record.texture = self._textures[id(colour)]
@@ -202,6 +213,11 @@ class DeviceScene:
             if material.eta is not None and material.k is not None:
                 record.eta = wp.vec3(*material.eta)  # type: ignore[misc]
                 record.k = wp.vec3(*material.k)  # type: ignore[misc]
+        if isinstance(material, Coated):
+            coat = fit_coat(material.roughness, material.ior)
+            record.exponent, record.ior = 1.0 / material.roughness, material.ior
+            record.eta, record.k = wp.vec3(*coat.coefficients[:3]), wp.vec3(*coat.coefficients[3:])
+            record.coat = wp.vec3(coat.excess, 1.0 / coat.transmitted, coat.internal)
         if shape.emission is not None:
             record.emission = wp.vec3(*shape.emission.radiance)  # type: ignore[misc]
             record.two_sided = int(shape.emission.two_sided)

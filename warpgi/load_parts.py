@@ -13,7 +13,7 @@ from PIL import Image, UnidentifiedImageError
 
 from warpgi.camera import Camera
 from warpgi.lights import Light
-from warpgi.materials import RGB, Colour, Conductor, Dielectric, Diffuse, Emissive, Material, Mirror, Texture
+from warpgi.materials import RGB, Coated, Colour, Conductor, Dielectric, Diffuse, Emissive, Material, Mirror, Texture
 from warpgi.scene import Shape
 
 GREY = Diffuse(0.8)
@@ -92,8 +92,8 @@ class Parts:
 
 
 def _without_texture(material: Material) -> Material:
-    if isinstance(material, Diffuse):
-        return Diffuse(mean_colour(material.albedo))
+    if isinstance(material, (Diffuse, Coated)):
+        return dataclasses.replace(material, albedo=mean_colour(material.albedo))
     if isinstance(material, Dielectric):
         return material
     return dataclasses.replace(material, reflectance=mean_colour(material.reflectance))

@@ -111,7 +111,30 @@ class Dielectric:
         checks.number("ior", self.ior, 1.0, 4.0)
 
 
-Material = Diffuse | Conductor | Mirror | Dielectric
+@dataclass(frozen=True)
+class Coated:
+    """A diffuse base under a glossy coat, as varnished wood or plastic; on both sides.
+
+    The coat is a dielectric Torrance-Sparrow lobe with the Blinn distribution. What it lets through, on the way in and
+    on the way out, the base reflects diffusely, light that the coat throws back to the base included: the model of
+    Mitsuba's `roughplastic` with its nonlinear colours. A white base loses no energy but what the fit of the coat's
+    albedo, a bound from above, takes (Kelemen, Szirmay-Kalos 2001).
+    """
+
+    albedo: Colour | Texture = (0.5, 0.5, 0.5)
+    """Reflectance of the base without its coat, linear RGB in [0, 1], or a texture of it."""
+    roughness: float = 0.05
+    """1 / exponent of the coat's Blinn distribution, in [1e-5, 1]; smaller is sharper."""
+    ior: float = 1.5
+    """Index of refraction of the coat, in [1, 4]; at 1 there is none."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "albedo", _reflectance("albedo", self.albedo))
+        checks.number("roughness", self.roughness, 1e-5, 1.0)
+        checks.number("ior", self.ior, 1.0, 4.0)
+
+
+Material = Diffuse | Conductor | Mirror | Dielectric | Coated
 
 
 @dataclass(frozen=True)

@@ -22,12 +22,12 @@ from warpgi.timing import Timings
 
 def reconstruct(
     samples: SampleBuffer,
-    method: LightField | AmbientOcclusion | SampleFilter | None = None,
+    method: LightField | AmbientOcclusion | TemporalLightField | SampleFilter | None = None,
     seed: int = 0,
     device: str | Device | None = None,
     progress: bool | Callable[[Progress], None] = False,
 ) -> Render:
-    """Reconstructs or filters indirect light, or ambient occlusion, from a sample buffer; no scene is needed.
+    """Reconstructs or filters indirect light, ambient occlusion, or defocus and motion, from samples; no scene is needed.
 
     Args:
         samples: the input, from `sample`, a file or any other renderer.
@@ -37,7 +37,7 @@ def reconstruct(
         progress: True shows a bar on standard error; a function gets a `Progress` after every pass.
 
     Returns:
-        Layers "indirect" (or "image" for ambient occlusion), "albedo", "normal", "position", "hit_distance", and
+        Layers "indirect" (or "image" for what makes the whole picture), "albedo", "normal", "position", "hit_distance", and
         "direct" where the samples hold it. `counts` says how many samples could not be used and how many rays found no
         support.
 

@@ -56,6 +56,13 @@ class PrimaryHits:
     """What they reflect, shape (M, 3), float32."""
     per_pixel: int
     """Rows of a pixel."""
+    material: np.ndarray | None = None
+    """Number of the scene's shape, whose material it is, shape (M,), int32; with the next two where glossy surfaces
+    are recorded."""
+    wo: np.ndarray | None = None
+    """Unit vectors towards what sees them, shape (M, 3), float32."""
+    reflectance: np.ndarray | None = None
+    """Albedo of the material there, shape (M, 3), float32; `albedo` then multiplies the BSDF of what is not diffuse."""
 
 
 class Reconstruction:
@@ -106,7 +113,7 @@ class Reconstruction:
         self.tree.size_by_neighbours(rays, preprocessing.neighbours, preprocessing.alpha)
         self.escaped = np.flatnonzero(state.is_escaped).astype(np.int32)
         self.tree.shrink(rays, preprocessing.margin, self.escaped, self.extent)
-        self.sky = self._sky(self.escaped)
+        self.sky = make_sky(samples, self.escaped, device)
         self.counts = {name: count for name, count in state.counts.items() if name != "primary_missed"}
         self.counts |= {"splats": len(splats), "reconstruction_rays": 0}
         for _ in range(recursions):
@@ -162,24 +169,6 @@ class Reconstruction:
         self._receiver_normals = device.array(receivers.normal, wp.vec3)
         self._receiver_albedo = device.array(receivers.albedo, wp.vec3)
 
-    def _sky(self, escaped: np.ndarray) -> kernels.Sky:
-        """Mean radiance of escaped rays by direction; texels that no ray met take the mean of all."""
-        sky = kernels.Sky()
-        size = 0
-        texels = np.zeros((0, 3), np.float32)
-        if len(escaped):
-            radiance = self.samples.radiance[escaped].astype(np.float64)
-            varies = bool(np.ptp(radiance, axis=0).any())
-            size = int(np.clip(np.sqrt(len(escaped) / SKY_RAYS_PER_TEXEL), 1, SKY_MAX_SIZE)) if varies else 1
-            place = _octahedral(self.samples.direction[escaped], size)
-            count = np.bincount(place, minlength=size * size)
-            sums = [np.bincount(place, radiance[:, c], size * size) for c in range(3)]
-            mean = radiance.mean(axis=0)
-            filled = np.stack(sums, axis=-1) / np.maximum(count, 1)[:, None]
-            texels = np.where(count[:, None] > 0, filled, mean).astype(np.float32)
-        sky.size, sky.radiance = size, self.device.array(texels, wp.vec3)
-        return sky
-
     def _make_receivers(
         self, sample: np.ndarray, origins: wp.array, normals: wp.array, per_pixel: int
     ) -> kernels.Receivers:
@@ -220,6 +209,25 @@ class Reconstruction:
         parts = [device.array(part, wp.vec3) for part in (samples.hit_direct, samples.throughput)]
         device.launch(kernels.relight_splats, len(splats), [receivers, gathered, rays, *parts], [self._radiance])
         self.tree.set_radiance(self._radiance)
+
+
+def make_sky(samples: SampleBuffer, escaped: np.ndarray, device: Device) -> kernels.Sky:
+    """Mean radiance of escaped rays by direction; texels that no ray met take the mean of all."""
+    sky = kernels.Sky()
+    size = 0
+    texels = np.zeros((0, 3), np.float32)
+    if len(escaped):
+        radiance = samples.radiance[escaped].astype(np.float64)
+        varies = bool(np.ptp(radiance, axis=0).any())
+        size = int(np.clip(np.sqrt(len(escaped) / SKY_RAYS_PER_TEXEL), 1, SKY_MAX_SIZE)) if varies else 1
+        place = _octahedral(samples.direction[escaped], size)
+        count = np.bincount(place, minlength=size * size)
+        sums = [np.bincount(place, radiance[:, c], size * size) for c in range(3)]
+        mean = radiance.mean(axis=0)
+        filled = np.stack(sums, axis=-1) / np.maximum(count, 1)[:, None]
+        texels = np.where(count[:, None] > 0, filled, mean).astype(np.float32)
+    sky.size, sky.radiance = size, device.array(texels, wp.vec3)
+    return sky
 
 
 #: What a reconstruction launches, to be compiled first: a kernel of each module.

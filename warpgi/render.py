@@ -203,3 +203,7 @@ def _check(scene: Scene, method: Method) -> None:
     if not isinstance(method, tuple(METHODS.values())):
         names = ", ".join(kind.__name__ for kind in METHODS.values())
         raise TypeError(f"method is {type(method).__name__}, expected the settings of one: {names}")
+    if scene.moves and not getattr(method, "takes_motion", False):
+        able = [kind.__name__ for kind in METHODS.values() if getattr(kind, "takes_motion", False) is True]
+        want = ", ".join([*able, "LightField(primary_rays=True)"])
+        raise ValueError(f"the scene moves, which {type(method).__name__} cannot render, expected one of {want}")

@@ -35,6 +35,11 @@ OPTIONAL = {
 }
 
 
+# Optional arrays that no version of the file format has.
+UNFILED = {"wo": 3, "reflectance": 3, "base_radiance": 3}
+UNFILED_INTEGERS = ("material", "layer")
+
+
 class Checked(NamedTuple):
     """What each sample of a buffer is good for."""
 
@@ -128,6 +133,21 @@ class SampleBuffer:
     """Path throughput at the secondary hit: what its indirect light is multiplied by, shape (N, 3)."""
     hit_direct: np.ndarray | None = None
     """Direct light at the secondary hit, part of `radiance` [W/(sr m^2)], shape (N, 3)."""
+    wo: np.ndarray | None = None
+    """Unit vector from `origin` to what sees it, shape (N, 3); goes with `material`. Files hold neither it nor the
+    four arrays below, which only glossy surfaces need."""
+    material: np.ndarray | None = None
+    """Number in `materials` of the primary hit's, int32, shape (N,)."""
+    reflectance: np.ndarray | None = None
+    """Albedo or reflectance of that material at `origin`, shape (N, 3). Where it is not diffuse, `albedo` is what
+    multiplies its BSDF: 1, or what mirrors before it left."""
+    layer: np.ndarray | None = None
+    """Layer that the secondary ray was drawn from, int32, shape (N,): 0 diffuse, 1 glossy."""
+    base_radiance: np.ndarray | None = None
+    """Part of `radiance` that left the secondary hit by way of a diffuse layer, shape (N, 3); the rest has
+    `bandwidth`."""
+    materials: tuple[Any, ...] = ()
+    """What `material` counts."""
     coc: tuple[float, float] = (0.0, 0.0)
     """C0, C1: the circle of confusion at depth z has the radius C0/z + C1 [pixels]."""
     pixel_to_camera: np.ndarray = field(default_factory=lambda: np.eye(4))
@@ -151,6 +171,12 @@ class SampleBuffer:
             shape = (count, columns) if columns else (count,)
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, _array(name, getattr(self, name), shape, np.float32, reason))
+        for name, columns in UNFILED.items():
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, _array(name, getattr(self, name), (count, columns), np.float32, reason))
+        for name in UNFILED_INTEGERS:
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, _array(name, getattr(self, name), (count,), np.int32, reason))
         object.__setattr__(self, "coc", tuple(checks.finite_array("coc", self.coc, (2,)).tolist()))
         matrix = checks.finite_array("pixel_to_camera", self.pixel_to_camera, (4, 4))
         object.__setattr__(self, "pixel_to_camera", matrix)
@@ -172,7 +198,7 @@ class SampleBuffer:
 
     def __repr__(self) -> str:
         spp = f"{self.spp} spp" if self.pixel is None else f"{len(self)} samples"
-        optional = [name for name in OPTIONAL if getattr(self, name) is not None]
+        optional = [name for name in (*OPTIONAL, *UNFILED, *UNFILED_INTEGERS) if getattr(self, name) is not None]
         return f"SampleBuffer({self.width} x {self.height}, {spp}{', with ' if optional else ''}{', '.join(optional)})"
 
     @property
@@ -183,7 +209,8 @@ class SampleBuffer:
     @property
     def bytes_per_sample(self) -> int:
         """Bytes on the host for one sample: 72, and more for each optional array."""
-        arrays = [getattr(self, name) for name in (*REQUIRED, *OPTIONAL, "pixel")]
+        names = (*REQUIRED, *OPTIONAL, *UNFILED, *UNFILED_INTEGERS, "pixel")
+        arrays = [getattr(self, name) for name in names]
         if self.screen is not None:
             arrays += [value for value in vars(self.screen).values() if isinstance(value, np.ndarray)]
         return sum(array.itemsize * math.prod(array.shape[1:]) for array in arrays if array is not None)
@@ -232,10 +259,19 @@ class SampleBuffer:
         missed = _largest(self.origin) >= NO_HIT
         far = _largest(self.hit) >= NO_HIT
         primary = _finite(
-            self.origin, self.albedo, self.direct, self.origin_motion, self.image_xy, self.lens, self.time
+            self.origin,
+            self.albedo,
+            self.direct,
+            self.origin_motion,
+            self.image_xy,
+            self.lens,
+            self.time,
+            self.wo,
+            self.reflectance,
         )
         ray = _finite(self.origin, self.hit, self.radiance)
         rest = _finite(self.origin, self.bandwidth, self.hit_motion, self.time, self.throughput, self.hit_direct)
+        rest = rest if self.base_radiance is None else rest & _finite(self.base_radiance)
         secondary = ray & (far | rest)
         zero_length = _all(self.hit == self.origin)
         origin_normal, hit_normal = _has_direction(self.origin_normal), _has_direction(self.hit_normal)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import warp as wp
 
@@ -12,6 +14,7 @@ from warpgi.film import Film
 from warpgi.job import Job
 from warpgi.kernels import rng
 from warpgi.kernels.path import PathSettings
+from warpgi.kernels.primary_samples import PrimaryArrays, trace_primary_samples
 from warpgi.kernels.samples import SampleArrays, trace_samples
 from warpgi.methods.path import NEVER, Sampler
 from warpgi.reconstruction import PrimaryHits
@@ -21,8 +24,22 @@ from warpgi.scene import Scene
 PRIMARY = ("origin", "origin_normal", "albedo")
 SECONDARY = ("hit", "hit_normal", "radiance")
 HIT_LIGHT = ("throughput", "hit_direct")
+# For scenes with a lens or in motion, and for glossy surfaces: of primary hits, then of secondary rays.
+MOTION = {"time": float, "origin_motion": wp.vec3}, {"hit_motion": wp.vec3}
+GLOSS = (
+    {"material": int, "wo": wp.vec3, "reflectance": wp.vec3},
+    {"layer": int, "bandwidth": float, "base_radiance": wp.vec3},
+)
 #: Device bytes of a primary hit, and of a secondary ray beside it.
 PRIMARY_BYTES, SECONDARY_BYTES = 12 * len(PRIMARY), 12 * len(SECONDARY + HIT_LIGHT)
+
+
+def path_settings(job: Job, max_depth: int, roulette_depth: int, sampler: Sampler) -> PathSettings:
+    """Settings of the kernels that trace samples."""
+    settings = PathSettings()
+    settings.max_depth, settings.roulette_depth, settings.seed = max_depth, roulette_depth, job.seed
+    settings.sampler = int(rng.SOBOL if sampler is Sampler.SOBOL else rng.INDEPENDENT)
+    return settings
 
 
 def trace_sample_buffer(
@@ -35,33 +52,88 @@ def trace_sample_buffer(
     roulette_depth: int,
     sampler: Sampler,
     with_hit_light: bool,
+    with_gloss: bool = False,
 ) -> tuple[SampleBuffer, PrimaryHits]:
     """Traces a picture's samples; positions stay relative to the device's origin, other light goes to the film.
 
     The first `spp` of a pixel's `hits` primary hits send secondary rays, which make the buffer; light is to be gathered
-    at all of them.
+    at all of them. `with_gloss` records glossy primary hits too, with what their BSDFs need; else only diffuse ones.
     """
-    device = job.device
+    device, scene = job.device, job.scene.scene
     pixels = job.size[0] * job.size[1]
-    settings = PathSettings()
-    settings.max_depth, settings.roulette_depth, settings.seed = max_depth, roulette_depth, job.seed
-    settings.sampler = int(rng.SOBOL if sampler is Sampler.SOBOL else rng.INDEPENDENT)
     arrays = SampleArrays()
     arrays.hits, arrays.spp = hits, spp
-    sizes = dict.fromkeys(PRIMARY, pixels * hits) | dict.fromkeys(SECONDARY, pixels * spp)
-    sizes |= dict.fromkeys(HIT_LIGHT, pixels * spp if with_hit_light else 0)
-    for name, count in sizes.items():
-        setattr(arrays, name, device.zeros(count, wp.vec3))
+    of_hits: dict[str, Any] = dict.fromkeys(PRIMARY, wp.vec3)
+    of_rays: dict[str, Any] = dict.fromkeys(SECONDARY, wp.vec3)
+    if with_hit_light:
+        of_rays |= dict.fromkeys(HIT_LIGHT, wp.vec3)
+    for wanted, (more_of_hits, more_of_rays) in ((scene.moves, MOTION), (with_gloss, GLOSS)):
+        if wanted:
+            of_hits, of_rays = of_hits | more_of_hits, of_rays | more_of_rays
+    if scene.camera.lens_radius > 0.0:
+        of_hits["lens"] = wp.vec2
+    for names, count in ((of_hits, pixels * hits), (of_rays, pixels * spp)):
+        for name, dtype in names.items():
+            setattr(arrays, name, device.zeros(count, dtype))
     for band in film.bands:
         arrays.first_pixel = band.start
-        inputs = [job.scene.struct, job.camera, settings, light_samples]
+        inputs = [job.scene.struct, job.camera, path_settings(job, max_depth, roulette_depth, sampler), light_samples]
         device.launch(trace_samples, len(band), inputs, [film.load(band), arrays])
     # on cpu these are the very arrays, which the buffer keeps alive
-    values = {name: getattr(arrays, name).numpy() for name, count in sizes.items() if count}
-    every = PrimaryHits(values["origin"], values["origin_normal"], values["albedo"], hits)
+    values = {name: getattr(arrays, name).numpy() for name in of_hits | of_rays}
+    gloss = {name: values[name] for name in GLOSS[0] if with_gloss}
+    every = PrimaryHits(values["origin"], values["origin_normal"], values["albedo"], hits, **gloss)
     if hits > spp:
-        values |= {name: values[name].reshape(pixels, hits, 3)[:, :spp].reshape(-1, 3) for name in PRIMARY}
-    return SampleBuffer(job.size[0], job.size[1], spp, **values), every
+        for name in of_hits:
+            of_pixel = values[name].reshape(pixels, hits, *values[name].shape[1:])
+            values[name] = np.ascontiguousarray(of_pixel[:, :spp]).reshape(-1, *values[name].shape[1:])
+    if with_gloss:
+        values["materials"] = tuple(shape.material for shape in scene.shapes)
+    return SampleBuffer(job.size[0], job.size[1], spp, **values, **_projection(job)), every
+
+
+def trace_primary_buffer(
+    job: Job, film: Film, spp: int, max_depth: int, roulette_depth: int, sampler: Sampler
+) -> SampleBuffer:
+    """Traces a picture's camera rays as path tracing does; they go to the film too. Positions are in camera space."""
+    device, scene = job.device, job.scene.scene
+    count = job.size[0] * job.size[1] * spp
+    dtypes: dict[str, Any] = {"image_xy": wp.vec2, "origin": wp.vec3, "hit": wp.vec3, "hit_normal": wp.vec3}
+    dtypes["radiance"] = wp.vec3
+    if scene.camera.lens_radius > 0.0:
+        dtypes["lens"] = wp.vec2
+    if scene.moves:
+        dtypes |= {"time": float, "hit_motion": wp.vec3}
+    arrays = PrimaryArrays()
+    arrays.spp = spp
+    for name, dtype in dtypes.items():
+        setattr(arrays, name, device.zeros(count, dtype))
+    for band in film.bands:
+        arrays.first_pixel = band.start
+        inputs = [job.scene.struct, job.camera, path_settings(job, max_depth, roulette_depth, sampler)]
+        device.launch(trace_primary_samples, len(band), inputs, [film.load(band), arrays])
+    values = {name: getattr(arrays, name).numpy() for name in dtypes}
+    values["origin_normal"] = np.tile(np.array([0.0, 0.0, -1.0], np.float32), (count, 1))
+    values["albedo"] = np.ones((count, 3), np.float32)
+    return SampleBuffer(job.size[0], job.size[1], spp, **values, **_projection(job))
+
+
+def _projection(job: Job) -> dict[str, Any]:
+    """Circle of confusion and focal plane of the camera, in camera space: the viewing direction is -z."""
+    camera, (width, height) = job.camera, job.size
+    focus = camera.focus_distance
+    step = np.array([2.0 * camera.tan_x / width, 2.0 * camera.tan_y / height]) * focus
+    matrix = np.array(
+        [
+            [step[0], 0.0, 0.0, -camera.tan_x * focus],
+            [0.0, -step[1], 0.0, camera.tan_y * focus],
+            [0.0, 0.0, 0.0, -focus],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+    # a point at depth z blurs to the radius R |1 - focus / z| on the focal plane
+    radius = camera.lens_radius / step[1]
+    return {"pixel_to_camera": matrix, "coc": (-radius * focus, radius) if radius > 0.0 else (0.0, 0.0)}
 
 
 def sample(
@@ -72,11 +144,14 @@ def sample(
     device: str | Device | None = None,
     max_depth: int | None = None,
     recursive: bool = False,
+    glossy: bool = False,
+    primary: bool = False,
 ) -> SampleBuffer:
     """Path-traces the samples that `reconstruct` takes: secondary rays and the light that comes along them.
 
     Light sampling at every vertex, several bounces; emission that a secondary ray meets is direct light and left out.
-    Only diffuse primary hits are recorded, behind mirrors and glass where these come first.
+    Only diffuse primary hits are recorded, behind mirrors and glass where these come first. Lens coordinates, times
+    and motion are there where the camera has a lens and the scene moves.
 
     Args:
         scene: what to sample.
@@ -86,9 +161,13 @@ def sample(
         device: "cpu", "cuda:0", a `Device`, or None for a GPU if there is one.
         max_depth: longest path in segments, at least 3 for any indirect light; None is unlimited.
         recursive: record throughput and direct light at the secondary hits as well, for recursive filtering.
+        glossy: record glossy primary hits too, with what their BSDFs need, and bandwidths and layers at the secondary
+            hits; nothing more than without it where the scene has no glossy surface.
+        primary: record the camera's own rays and all light that comes along them, for defocus and motion: `origin` is
+            on the lens, `hit` what the ray met, and both are in camera space, where the viewing direction is -z.
 
     Returns:
-        A buffer in world coordinates; 72 bytes a sample, 96 with `recursive`.
+        A buffer in world coordinates, or camera space with `primary`; 72 bytes a sample, 96 with `recursive`.
 
     Raises:
         TypeError, ValueError: an argument is wrong; nothing has been computed then.
@@ -101,17 +180,23 @@ def sample(
     """
     if not isinstance(scene, Scene):
         raise TypeError(f"scene is {type(scene).__name__}, expected Scene")
+    if primary and (recursive or glossy):
+        raise ValueError("primary goes with neither recursive nor glossy, expected it alone")
     checks.count("spp", spp)
     size = checks.image_size(size)
     depth = NEVER if max_depth is None else checks.count("max_depth", max_depth)
     where = as_device(device)
-    where.load([trace_samples])
+    where.load([trace_primary_samples if primary else trace_samples])
     on_device = DeviceScene(scene, where)
     film = Film(
         size, where, where.memory_limit - on_device.nbytes - size[0] * size[1] * spp * (PRIMARY_BYTES + SECONDARY_BYTES)
     )
     job = Job(on_device, on_device.camera(size), size, checks.count("seed", seed, 0), where)
-    samples, _ = trace_sample_buffer(job, film, spp, spp, 1, depth, 5, Sampler.SOBOL, recursive)
+    if primary:
+        return trace_primary_buffer(job, film, spp, depth, 5, Sampler.SOBOL)
+    samples, _ = trace_sample_buffer(
+        job, film, spp, spp, 1, depth, 5, Sampler.SOBOL, recursive, glossy and scene.is_glossy
+    )
     centre = on_device.centre.astype(np.float32)
     for points in (samples.origin, samples.hit):
         met = np.abs(points).max(axis=1) < NO_HIT

@@ -11,7 +11,7 @@ import numpy as np
 from warpgi import checks
 from warpgi.camera import Camera
 from warpgi.lights import DistantLight, Environment, Light, PointLight, SpotLight
-from warpgi.materials import Conductor, Dielectric, Diffuse, Emissive, Material, Mirror
+from warpgi.materials import Coated, Conductor, Dielectric, Diffuse, Emissive, Material, Mirror
 
 # A triangle whose doubled area is below this part of its longest edge squared has no usable normal.
 DEGENERATE_RATIO = 1e-10
@@ -45,6 +45,9 @@ class Shape:
     """Texture coordinates at the vertices, shape (V, 2); needed where the material has a texture."""
     name: str = "shape"
     """How errors call it."""
+    motion: Any = None
+    """How far its vertices go in a straight line from time 0 to 1 [world units], one vector or shape (V, 3); None where
+    it is still. Shading normals turn with their triangle."""
     degenerate_count: int = field(default=0, init=False)
     """Triangles that were dropped because they have no area."""
 
@@ -59,7 +62,7 @@ class Shape:
         if faces.min() < 0 or faces.max() >= len(vertices):
             bad = faces.min() if faces.min() < 0 else faces.max()
             raise ValueError(f"{name} faces name vertex {bad}, expected 0 to {len(vertices) - 1}")
-        if not isinstance(self.material, (Diffuse, Conductor, Mirror, Dielectric)):
+        if not isinstance(self.material, (Diffuse, Conductor, Mirror, Dielectric, Coated)):
             raise TypeError(f"{name} material is {type(self.material).__name__}, expected a warpgi material")
         if self.emission is not None and not isinstance(self.emission, Emissive):
             raise TypeError(f"{name} emission is {type(self.emission).__name__}, expected Emissive")
@@ -78,10 +81,20 @@ class Shape:
         if self.normals is not None:
             normals = checks.finite_array(f"{name} normals", self.normals, (len(vertices), 3))
             object.__setattr__(self, "normals", normals)
+        if self.motion is not None:
+            object.__setattr__(self, "motion", self._checked_motion())
         if self.uv is not None:
             object.__setattr__(self, "uv", checks.finite_array(f"{name} uv", self.uv, (len(vertices), 2)))
         if self.uv is None and self.texture is not None:
             raise ValueError(f"{name} has a texture but no uv, expected uv of shape ({len(vertices)}, 2)")
+
+    def _checked_motion(self) -> np.ndarray | None:
+        name, count = self.name, len(self.vertices)
+        motion = np.asarray(self.motion)
+        if motion.ndim < 2:
+            motion = np.broadcast_to(checks.finite_array(f"{name} motion", self.motion, (3,)), (count, 3))
+        motion = checks.finite_array(f"{name} motion", motion, (count, 3))
+        return np.ascontiguousarray(motion) if motion.any() else None
 
     @property
     def texture(self):
@@ -140,11 +153,21 @@ class Scene:
         """Triangles that were dropped because they have no area."""
         return sum(shape.degenerate_count for shape in self.shapes)
 
+    @property
+    def moves(self) -> bool:
+        """Whether any shape does."""
+        return any(shape.motion is not None for shape in self.shapes)
+
+    @property
+    def is_glossy(self) -> bool:
+        """Whether any shape has a glossy lobe of some width."""
+        return any(isinstance(shape.material, (Conductor, Coated)) for shape in self.shapes)
+
     def bounds(self) -> np.ndarray:
-        """Smallest and largest vertex coordinates, shape (2, 3), float64."""
-        low = np.min([shape.vertices.min(axis=0) for shape in self.shapes], axis=0)
-        high = np.max([shape.vertices.max(axis=0) for shape in self.shapes], axis=0)
-        return np.stack([low, high])
+        """Smallest and largest vertex coordinates at any time, shape (2, 3), float64."""
+        ends = [shape.vertices for shape in self.shapes]
+        ends += [shape.vertices + shape.motion for shape in self.shapes if shape.motion is not None]
+        return np.stack([np.min([e.min(axis=0) for e in ends], axis=0), np.max([e.max(axis=0) for e in ends], axis=0)])
 
     def has_light(self) -> bool:
         """Whether anything in it emits."""

@@ -40,11 +40,12 @@ class SplatTree:
         self.noise = noise
         self.count = len(splats)
         self.block_count = max(1, -(-self.count // LANES))  # of an empty tree all lanes are unused
-        self.order = self._hilbert_order(hits, splats)
-        self._lay_out_levels()
+        self.order = hilbert_order(device, hits, splats)
+        self.levels, first = tree_levels(self.block_count)
+        self.node_count = len(first)
         struct = SplatTreeStruct()
         struct.nodes = device.zeros(self.node_count * int(bvh.NODE_STRIDE), float)
-        struct.first = device.array(self._first, int)
+        struct.first = device.array(first, int)
         struct.blocks = device.zeros(self.block_count * int(bvh.BLOCK_STRIDE), float)
         struct.count, struct.block_count = self.count, self.block_count
         self.struct = struct
@@ -57,36 +58,6 @@ class SplatTree:
         """Bytes on the device."""
         arrays = (self.struct.nodes, self.struct.first, self.struct.blocks, self.order)
         return sum(array.capacity for array in arrays)
-
-    def _hilbert_order(self, hits: wp.array, splats: np.ndarray) -> wp.array:
-        device, count = self.device, self.count
-        source = device.array(splats, int)
-        if count == 0:
-            return source
-        # the bounds of what is a splat, found on the host: the samples came from there
-        points = hits.numpy()[splats]
-        low, high = points.min(axis=0), points.max(axis=0)
-        size = max(float((high - low).max()), 1e-30)
-        keys, values = device.zeros(2 * count, int), device.zeros(2 * count, int)
-        inputs = [hits, source, wp.vec3(*low.tolist()), 1.0 / size]
-        device.launch(bvh.order_keys, count, inputs, [keys, values])
-        wp.utils.radix_sort_pairs(keys, values, count)
-        return values[:count].contiguous()
-
-    def _lay_out_levels(self) -> None:
-        """Numbers nodes from the root down; a level has an eighth of the nodes of the one below."""
-        sizes = [-(-self.block_count // LANES)]
-        while sizes[-1] > 1:
-            sizes.append(-(-sizes[-1] // LANES))
-        starts = np.zeros(len(sizes), dtype=np.int64)
-        for level in reversed(range(len(sizes) - 1)):
-            starts[level] = starts[level + 1] + sizes[level + 1]
-        self.levels = [(int(start), size) for start, size in zip(starts, sizes, strict=True)]
-        self.node_count = sum(sizes)
-        self._first = np.empty(self.node_count, np.int32)
-        for level, (start, size) in enumerate(self.levels):
-            child = LANES * np.arange(size, dtype=np.int32)
-            self._first[start : start + size] = -1 - child if level == 0 else self.levels[level - 1][0] + child
 
     def refit(self, balls: bool = False) -> None:
         """Boxes from the splats' present sizes, as discs or as balls, level by level."""
@@ -105,7 +76,7 @@ class SplatTree:
         radius2 = self.device.zeros(self.count, float)
         # |d + (alpha - 1) (d.n) n|^2 = |d|^2 + (alpha^2 - 1) (d.n)^2
         self.device.launch(kernels.size_splats, self.count, [self.struct, rays, k, alpha * alpha - 1.0], [radius2])
-        self._set_radii(radius2, 1)
+        self.set_radius2(radius2)
 
     def shrink(self, rays: kernels.Rays, margin: float, escaped: np.ndarray, extent: float) -> None:
         """Shrinks what input rays cross (section 2.3.1); the same for any number of threads.
@@ -122,7 +93,7 @@ class SplatTree:
         self.device.launch(kernels.shrink_splats, self.count, inputs, [radius2], with_slot=True)
         inputs = [self.struct, rays, self.device.array(escaped, int), max(margin * extent, self.noise)]
         self.device.launch(kernels.shrink_by_escaped, len(escaped), inputs, [radius2], with_slot=True)
-        self._set_radii(radius2, slots)
+        self.set_radius2(radius2, slots)
 
     def count_crossed(self, rays: kernels.Rays, margin: float) -> int:
         """Splats that input rays cross before their ends, over all rays: 0 after shrinking."""
@@ -141,6 +112,43 @@ class SplatTree:
         """Takes the splats' radiance anew from that of all samples."""
         self.device.launch(bvh.fill_radiance, self.count, [radiance, self.order], [self.struct.blocks])
 
-    def _set_radii(self, radius2: wp.array, slots: int) -> None:
+    def set_radius2(self, radius2: wp.array, slots: int = 1) -> None:
+        """Gives splats new squared radii, the least of the slots, and fits the boxes to them."""
         self.device.launch(bvh.fill_radii, self.count, [radius2, slots, self.count], [self.struct.blocks])
         self.refit()
+
+
+def hilbert_order(device: Device, points: wp.array, chosen: np.ndarray) -> wp.array:
+    """The chosen points' numbers along a Hilbert curve through the smallest cube about them, on the device."""
+    count = len(chosen)
+    source = device.array(chosen, int)
+    if count == 0:
+        return source
+    # the bounds of what is chosen, found on the host: the samples came from there
+    places = points.numpy()[chosen]
+    low, high = places.min(axis=0), places.max(axis=0)
+    size = max(float((high - low).max()), 1e-30)
+    keys, values = device.zeros(2 * count, int), device.zeros(2 * count, int)
+    inputs = [points, source, wp.vec3(*low.tolist()), 1.0 / size]
+    device.launch(bvh.order_keys, count, inputs, [keys, values])
+    wp.utils.radix_sort_pairs(keys, values, count)
+    return values[:count].contiguous()
+
+
+def tree_levels(block_count: int) -> tuple[list[tuple[int, int]], np.ndarray]:
+    """(first node, nodes) of each level from the lowest up, and each node's first child, below 0 a block.
+
+    Nodes are numbered from the root down; a level has an eighth of the nodes of the one below.
+    """
+    sizes = [-(-block_count // LANES)]
+    while sizes[-1] > 1:
+        sizes.append(-(-sizes[-1] // LANES))
+    starts = np.zeros(len(sizes), dtype=np.int64)
+    for level in reversed(range(len(sizes) - 1)):
+        starts[level] = starts[level + 1] + sizes[level + 1]
+    levels = [(int(start), size) for start, size in zip(starts, sizes, strict=True)]
+    first = np.empty(sum(sizes), np.int32)
+    for level, (start, size) in enumerate(levels):
+        child = LANES * np.arange(size, dtype=np.int32)
+        first[start : start + size] = -1 - child if level == 0 else levels[level - 1][0] + child
+    return levels, first

@@ -14,6 +14,7 @@ from warpgi.methods.light_field import LightField
 from warpgi.methods.path import PathTracing, Sampler
 from warpgi.methods.photon_map import Kernel, PhotonMap
 from warpgi.methods.random_parameter_filter import RandomParameterFilter
+from warpgi.methods.temporal_light_field import TemporalLightField
 
 
 class Method(Protocol):
@@ -59,6 +60,7 @@ METHODS: dict[str, type] = {
     "random-parameter-filter": RandomParameterFilter,
     "irradiance-filter": IrradianceFilter,
     "photon-map": PhotonMap,
+    "temporal-light-field": TemporalLightField,
 }
 
 #: Those that make a picture of a sample buffer alone, and those that filter the layers of a finished one.
@@ -79,4 +81,5 @@ __all__ = [
     "PhotonMap",
     "RandomParameterFilter",
     "Sampler",
+    "TemporalLightField",
 ]

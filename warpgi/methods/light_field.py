@@ -12,8 +12,10 @@ from warpgi.device import Device
 from warpgi.film import Film
 from warpgi.job import Job
 from warpgi.kernels.light_field import add_reflected
+from warpgi.kernels.primary_samples import trace_primary_samples
 from warpgi.kernels.samples import trace_samples
 from warpgi.kernels.splats import MAX_NEIGHBOURS
+from warpgi.lens_reconstruction import PRIMARY_SAMPLE_BYTES, LensReconstruction
 from warpgi.methods.path import NEVER, Sampler, check_paths
 from warpgi.methods.photon_map import PhotonMap, light_by_photons
 from warpgi.reconstruction import (
@@ -26,7 +28,9 @@ from warpgi.reconstruction import (
     pixel_means,
 )
 from warpgi.samples import SampleBuffer
-from warpgi.sampling import PRIMARY_BYTES, SECONDARY_BYTES, trace_sample_buffer
+from warpgi.sampling import PRIMARY_BYTES, SECONDARY_BYTES, trace_primary_buffer, trace_sample_buffer
+
+AnyReconstruction = Reconstruction | LensReconstruction
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,6 +76,10 @@ class LightField:
     """Segments after which Russian roulette may end an input path; None switches it off and needs a `max_depth`."""
     sampler: Sampler = Sampler.SOBOL
     """Where the input paths' random numbers come from."""
+    primary_rays: bool = False
+    """Reconstruct what the lens sees while the shutter is open from camera rays, not what surfaces reflect from
+    secondary rays (section 3.4); the whole picture, in the layer "image", and the way to render what moves. `rays` are
+    then those of a pixel; settings that say how indirect light is gathered mean nothing. 8 neighbours do well."""
 
     def __post_init__(self) -> None:
         checks.count("spp", self.spp)
@@ -89,6 +97,11 @@ class LightField:
         check_paths(self.max_depth, self.roulette_depth, self.sampler)
 
     @property
+    def takes_motion(self) -> bool:
+        """Whether it renders scenes that move."""
+        return self.primary_rays
+
+    @property
     def needs_light(self) -> bool:
         """Whether the picture of a scene without light is black."""
         return True
@@ -96,6 +109,8 @@ class LightField:
     @property
     def kernels(self) -> tuple[wp.Kernel, ...]:
         """What it launches."""
+        if self.primary_rays:
+            return (trace_primary_samples,)  # lens reconstruction loads its own, those for motion where it needs them
         return (trace_samples, *KERNELS, *(PhotonMap().kernels if self.photons else ()))
 
     @property
@@ -110,16 +125,24 @@ class LightField:
 
     def passes(self, hits: int | None = None) -> tuple[int, str]:
         """Reconstruction rays for each primary hit, at `hits` of them in a pixel, and what to call them."""
+        if self.primary_rays:
+            return self.rays, "rays"
         return max(1, round(self.rays / (hits or self.hits))), "rays per hit"
 
     def device_bytes(self, size: tuple[int, int]) -> int:
         """Device memory it takes beside scene and film."""
+        if self.primary_rays:
+            return size[0] * size[1] * self.spp * PRIMARY_SAMPLE_BYTES
         hit, ray = PRIMARY_BYTES + BYTES_PER_HIT, SECONDARY_BYTES + BYTES_PER_SAMPLE
         photons = PhotonMap(photons=self.photons).device_bytes(size) if self.photons else 0
         return size[0] * size[1] * (self.hits * hit + self.spp * ray) + photons
 
-    def prepare(self, job: Job, film: Film) -> Reconstruction:
+    def prepare(self, job: Job, film: Film) -> AnyReconstruction:
         """Traces the input, with what is not reconstructed going to the film, and makes splats of it."""
+        if self.primary_rays:
+            depths = self.max_depth or NEVER, self.roulette_depth or NEVER
+            rays = trace_primary_buffer(job, film, self.spp, *depths, self.sampler)
+            return self.reconstruction(rays, job.device, job.seed)
         samples, hits = trace_sample_buffer(
             job,
             film,
@@ -133,13 +156,16 @@ class LightField:
         )
         caustics = light_by_photons(job, self.photons, samples, hits) if self.photons else None
         state = self.reconstruction(samples, job.device, job.seed, hits)
-        state.caustics = caustics
+        if isinstance(state, Reconstruction):
+            state.caustics = caustics
         return state
 
     def reconstruction(
         self, samples: SampleBuffer, device: Device, seed: int, hits: PrimaryHits | None = None
-    ) -> Reconstruction:
+    ) -> AnyReconstruction:
         """Splats made of a sample buffer, ready for `gather`."""
+        if self.primary_rays:
+            return LensReconstruction(samples, device, self.preprocessing, seed)
         return Reconstruction(
             samples,
             device,
@@ -150,12 +176,14 @@ class LightField:
             recursive_rays=self.recursive_rays,
         )
 
-    def estimate(self, job: Job, state: Reconstruction, film: Film, first: int, count: int) -> None:
+    def estimate(self, job: Job, state: AnyReconstruction, film: Film, first: int, count: int) -> None:
         """Sends `count` reconstruction rays from every primary hit."""
         state.gather(first, count, self.passes()[0])
 
-    def finish(self, job: Job, state: Reconstruction, film: Film) -> dict[str, np.ndarray]:
+    def finish(self, job: Job, state: AnyReconstruction, film: Film) -> dict[str, np.ndarray]:
         """Adds the reconstructed light to the film's indirect layer."""
+        if isinstance(state, LensReconstruction):
+            return self.layers(state)
         reflected = state.reflected()
         for band in film.bands:
             job.device.launch(add_reflected, len(band), [film.load(band), reflected, self.hits])
@@ -163,10 +191,12 @@ class LightField:
                 job.device.launch(add_reflected, len(band), [film.load(band), state.caustics, self.hits])
         return {}
 
-    def layers(self, state: Reconstruction) -> dict[str, np.ndarray]:
-        """The indirect layer of a reconstruction without a scene."""
+    def layers(self, state: AnyReconstruction) -> dict[str, np.ndarray]:
+        """The indirect layer of a reconstruction without a scene, or the picture seen through the lens."""
+        if isinstance(state, LensReconstruction):
+            return {"image": state.image()}
         return {"indirect": pixel_means(state.samples, state.reflected().numpy())}
 
-    def counts(self, state: Reconstruction) -> dict[str, int]:
+    def counts(self, state: AnyReconstruction) -> dict[str, int]:
         """Reconstruction rays, and what was dropped, cut short or without support."""
         return state.all_counts()

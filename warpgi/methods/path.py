@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import ClassVar
 
 import numpy as np
 import warp as wp
@@ -65,6 +66,8 @@ class PathTracing:
     def __post_init__(self) -> None:
         checks.count("spp", self.spp)
         check_paths(self.max_depth, self.roulette_depth, self.sampler)
+
+    takes_motion: ClassVar[bool] = True
 
     @property
     def keeps_all_in_film(self) -> bool:
