@@ -21,11 +21,15 @@ class SplatTree:
         hits, normals, radiance: of all samples, vec3 arrays on the device.
         splats: which samples are splats, int array on the host.
         noise: rounding of the positions.
+        order: what `order` shall be; None: along a Hilbert curve.
 
     Attributes:
         struct: what kernels see.
         order: place in the tree -> sample, on the device.
     """
+
+    flat = 1.0
+    """1 where splats are discs, 1 - 1/alpha^2 where they are ellipsoids, alpha times as thin as wide."""
 
     def __init__(
         self,
@@ -35,12 +39,13 @@ class SplatTree:
         radiance: wp.array,
         splats: np.ndarray,
         noise: float,
+        order: wp.array | None = None,
     ) -> None:
         self.device = device
         self.noise = noise
         self.count = len(splats)
         self.block_count = max(1, -(-self.count // LANES))  # of an empty tree all lanes are unused
-        self.order = hilbert_order(device, hits, splats)
+        self.order = hilbert_order(device, hits, splats) if order is None else order
         self.levels, first = tree_levels(self.block_count)
         self.node_count = len(first)
         struct = SplatTreeStruct()
@@ -64,7 +69,7 @@ class SplatTree:
         start, size = self.levels[0]
         blocks, nodes = self.struct.blocks, self.struct.nodes
         self.device.launch(
-            bvh.fit_leaves, size, [blocks, self.block_count, start, self.noise, float(not balls)], [nodes]
+            bvh.fit_leaves, size, [blocks, self.block_count, start, self.noise, 0.0 if balls else self.flat], [nodes]
         )
         for (start, size), (below, count_below) in zip(self.levels[1:], self.levels, strict=False):
             self.device.launch(bvh.fit_level, size, [start, below, count_below], [nodes])
