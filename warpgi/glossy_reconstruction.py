@@ -117,7 +117,8 @@ class LobeTree(SplatTree):
         chosen: np.ndarray,
     ) -> None:
         device = state.device
-        self.flat = 1.0 - 1.0 / state.preprocessing.alpha**2
+        # ellipsoids, alpha times as thin as wide
+        self._flat = 1.0 - 1.0 / state.preprocessing.alpha**2
         order = lobe_order(state, axes, kappa, chosen)
         super().__init__(device, *arrays, chosen, state.noise, order)
         self.axes = device.zeros(self.block_count * int(kernels.AXIS_STRIDE), float)
@@ -129,6 +130,10 @@ class LobeTree(SplatTree):
         device.launch(kernels.fit_leaf_cones, size, inputs, [self.cones])
         for (start, size), (below, count_below) in zip(self.levels[1:], self.levels, strict=False):
             device.launch(kernels.fit_level_cones, size, [start, below, count_below], [self.cones])
+
+    def refit(self) -> None:
+        """Boxes from the lobes' present sizes, as ellipsoids."""
+        self._refit(self._flat)
 
     def size(self, lobes: kernels.Lobes, k: int) -> None:
         """Radii from the k-th nearest neighbour of like direction (Lehtinen et al. 2012, section 2.2)."""
