@@ -56,10 +56,10 @@ def follow(
     o_: wp.vec3,
     d_: wp.vec3,
 ):
-    """One camera path. At each surface lights bring what they can: what wide lobes at both ends send, geometry clamped.
+    """One camera path: lights bring what wide lobes at both ends send on, geometry clamped; a ray goes for the rest.
 
-    A ray goes on for the rest. Radiance that leaves a surface by its wide lobes reaches the camera with weight `joined`,
-    from which the lights' part at the surface before is taken off, other radiance with weight `rest`.
+    Radiance that leaves a surface by its wide lobes reaches the camera with weight `joined`, from which is taken off
+    what lights brought at the surface before; other radiance with weight `rest`.
     """
     o = o_
     d = d_

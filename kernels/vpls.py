@@ -3,7 +3,7 @@
 import warp as wp
 
 from warpgi.kernels.bsdf import wide_value
-from warpgi.kernels.direct import SHADOW_SHORTER, facing_normal, reflects
+from warpgi.kernels.direct import SHADOW_SHORTER, reflects
 from warpgi.kernels.photons import Photons
 from warpgi.kernels.rng import Sampler, sample_2d
 from warpgi.kernels.sampling import INV_PI, PI, make_frame, to_world

@@ -8,7 +8,6 @@ import math
 import numpy as np
 import pytest
 import warp as wp
-from noise import Z_LIMIT
 from scipy.stats import t as student
 
 import warpgi as gi
@@ -64,7 +63,7 @@ def one_light(**settings):
 
 
 def test_one_light_has_its_closed_form_and_a_hard_shadow():
-    """On a wall: flux x albedos / pi^2 x cosines / distance^2 where the light is seen, and exactly 0 where it is not."""
+    """On a wall: flux x albedos / pi^2 x cosines / distance^2 where the light is seen, exactly 0 where it is not."""
     scene, flux = one_light()
     method = gi.InstantRadiosity(paths=1, spp=1, near_light=NEAR.UNBOUNDED)
     seeds = [s for s in range(20) if len(lighting_of(scene, method, s).vpls.target) == 1]
@@ -163,9 +162,10 @@ def test_furnace():
     sx, sy = (g.reshape(-1, 1) * tan for g in np.meshgrid(grid, grid))
     lost, error = lost_to_clamping(np.asarray(camera.position), forward + right * sx + up * sy, near)
     assert lost > 0.05  # or nothing is shown
-    assert mean_t(means[NEAR.CLAMPED], whole * (1.0 - lost)) < 1.0 + Z_LIMIT * error * whole / np.std(
-        means[NEAR.CLAMPED]
-    )
+    # numpy's rays know the loss to a few parts in a thousand, as the renders do
+    apart = abs(np.mean(means[NEAR.CLAMPED]) - whole * (1.0 - lost))
+    renders = np.std(means[NEAR.CLAMPED], ddof=1) / math.sqrt(24)
+    assert apart < t_limit(means[NEAR.CLAMPED]) * math.hypot(renders, whole * error)
     assert np.mean(means[NEAR.CLAMPED]) < np.mean(means[NEAR.COMPENSATED])
 
 
@@ -253,8 +253,9 @@ def test_agrees_with_path_tracing(scene, settings):
         t = np.abs(found.mean(axis=0) - expected) / np.sqrt(variance)
         assert t.max() < t_limit(found, t.size), layer
     means = np.array([render.layers["indirect"].mean(dtype=np.float64) for render in renders])
-    error = math.hypot(means.std(ddof=1) / math.sqrt(sets), math.sqrt(reference.layers["variance"].mean() / 256.0 / 3.0))
-    assert abs(means.mean() - reference.layers["indirect"].mean(dtype=np.float64)) < t_limit(means) * error
+    squares = means.var(ddof=1) / sets + reference.layers["variance"].mean() / (size[0] * size[1])
+    apart = abs(means.mean() - reference.layers["indirect"].mean(dtype=np.float64))
+    assert apart < t_limit(means) * math.sqrt(squares)
 
 
 def test_shading_normals_count_as_for_paths():
@@ -263,14 +264,16 @@ def test_shading_normals_count_as_for_paths():
     tilted, aside = (np.tile(n, (4, 1)) for n in ((-0.5, 1.0, 0.0), (-1.0, 0.0, 0.7)))
     floor = gi.Shape([(-1, 0, -1), (1, 0, -1), (1, 0, 1), (-1, 0, 1)], faces, gi.Diffuse(0.8), normals=tilted)
     wall = gi.Shape([(1, 0, -1), (1, 2, -1), (1, 2, 1), (1, 0, 1)], faces, gi.Diffuse(0.8), normals=aside)
-    scene = gi.Scene([floor, wall], gi.Camera((-3, 1, 0), (1, 1, 0), fov=22.0), [gi.DistantLight((0.5, -1.0, 0.2), 1.0)])
+    scene = gi.Scene(
+        [floor, wall], gi.Camera((-3, 1, 0), (1, 1, 0), fov=22.0), [gi.DistantLight((0.5, -1.0, 0.2), 1.0)]
+    )
     method = gi.PathTracing(spp=1024, sampler=gi.Sampler.INDEPENDENT)
     expected = gi.render(scene, method, (16, 16), device="cpu").layers["indirect"].mean(dtype=np.float64)
     method = gi.InstantRadiosity(paths=500, spp=4)
     means = [gi.render(scene, method, (16, 16), seed, "cpu").layers["indirect"].mean() for seed in range(16)]
     # 2.6e5 paths know it to 0.5 %
-    assert mean_t(means, expected) < 1.0 + 0.005 * expected / np.std(means)
-    assert np.mean(means) == pytest.approx(expected, rel=0.03)
+    error = math.hypot(np.std(means, ddof=1) / 4.0, 0.005 * expected)
+    assert abs(np.mean(means) - expected) < t_limit(means) * error < 0.1 * expected
 
 
 def test_no_spike_is_left():

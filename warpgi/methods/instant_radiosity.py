@@ -46,8 +46,8 @@ NEAR = {
 }
 
 
-# `near_distance` over the radius of a path's share of the surface. Clamped lights and spheres lose light as it grows, three
-# times as much from 0.5 to 1; compensation pays with some rays more, for half the error from 1 to 2.
+# `near_distance` over the radius of a path's share of the surface. Clamped lights and spheres lose light as it grows,
+# three times as much from 0.5 to 1; compensation pays with some rays more, for half the error from 1 to 2.
 NEAR_SHARE = {NearLight.UNBOUNDED: 1.0, NearLight.CLAMPED: 1.0, NearLight.COMPENSATED: 2.0, NearLight.SPHERICAL: 0.5}
 
 
@@ -66,8 +66,7 @@ class InstantRadiosity:
     """
 
     paths: int = 64
-    """Paths from the lights for a set of virtual lights; each leaves one at every surface that it meets. Time grows with
-    it."""
+    """Paths from the lights for a set of virtual lights; each leaves one at every surface that it meets."""
     spp: int = 4
     """Camera paths per pixel."""
     set_spp: int | None = None
