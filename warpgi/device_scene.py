@@ -120,7 +120,7 @@ class DeviceScene:
         struct.face_shapes = self._upload(shape_of_face, int)
         struct.normals = self._upload(_per_vertex([s.normals for s in shapes], starts, 3), wp.vec3)
         struct.uvs = self._upload(_per_vertex([s.uv for s in shapes], starts, 2), wp.vec2)
-        struct.moving = int(self.scene.moves)
+        struct.moving, struct.time = int(self.scene.moves), 0.0
         motion = None
         if struct.moving:
             still = [shape.motion is None for shape in shapes]
