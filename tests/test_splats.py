@@ -65,7 +65,7 @@ class Splats:
 
     def set_radii(self, radii):
         radii = np.broadcast_to(np.asarray(radii, dtype=np.float32), len(self.hits))
-        self.tree._set_radii(self.device.array((radii * radii)[self.order], float), 1)
+        self.tree.set_radius2(self.device.array((radii * radii)[self.order], float))
 
     def radii(self):
         """In the order of the samples."""
@@ -117,7 +117,7 @@ def surfaces(count, seed=0):
 
 def walk(splats):
     """Blocks below the root, each with the path of (node, child) that leads there."""
-    first, found, stack = splats.tree._first, [], [(0, ())]
+    first, found, stack = splats.tree.struct.first.numpy(), [], [(0, ())]
     while stack:
         node, path = stack.pop()
         low, high = boxes(splats)[0][node], boxes(splats)[1][node]
