@@ -33,7 +33,7 @@ class IrradianceFilter(SampleFilter):
     The support is a sphere in the scene, in proportion to the harmonic mean distance of the secondary hits; weights
     fall with distance and difference of normals. Filters what diffuse surfaces reflect; what others do keeps its
     path-traced light. With `rays` it filters light that few reconstruction rays gathered from the samples' light field
-    (Lehtinen et al. 2012), guided by their lengths: several times less error than either alone in the same time.
+    (Lehtinen et al. 2012), guided by their lengths: less error than the same rays or the same samples alone.
 
     Raises:
         TypeError, ValueError: a setting is out of range, or they contradict each other.
