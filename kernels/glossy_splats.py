@@ -84,7 +84,7 @@ GLOSSY_SURFACE = (
     + FIND_SURFACE
     + TENT_MEAN
     + """
-    float glossy = 0.0f, distance = 0.0f, x = 0.0f, y = 0.0f, z = 0.0f, heaviest = 0.0f;
+    float glossy = 0.0f, reached = 0.0f, x = 0.0f, y = 0.0f, z = 0.0f, heaviest = 0.0f;
     int heaviest_splat = -1;
     for (int j = 0; j < size; ++j) {
         if (t_of[j] < limit && (place[j] >= 0) == any_front) {
@@ -92,7 +92,7 @@ GLOSSY_SURFACE = (
             if (kappa.data[splat] > 0.0f) {
                 const float w = 1.0f - wp::sqrt(e_of[j]);
                 glossy += w;
-                distance += w * t_of[j];
+                reached += w * t_of[j];
                 x += w * gx[j];
                 y += w * gy[j];
                 z += w * gz[j];
@@ -106,7 +106,7 @@ GLOSSY_SURFACE = (
     wp::vec_t<13, wp::float32> result;
     result[0] = r; result[1] = g; result[2] = b; result[3] = weight;
     result[4] = (float)cut; result[5] = (float)surfaces_passed; result[6] = seen_behind;
-    result[7] = glossy; result[8] = distance; result[9] = x; result[10] = y; result[11] = z;
+    result[7] = glossy; result[8] = reached; result[9] = x; result[10] = y; result[11] = z;
     float bits;
     memcpy(&bits, &heaviest_splat, 4);
     result[12] = bits;
