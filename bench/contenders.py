@@ -37,13 +37,17 @@ LADDERS: dict[str, tuple[Settings, ...]] = {
             (64, 400_000, 16),
         )
     ),
+    "instant-radiosity": tuple({"paths": paths} for paths in (10, 32, 64, 256, 1024)),
     "a-trous": powers(64),
     "random-parameter-filter": powers(16),
     "irradiance-filter": powers(64),
 }
 
 #: Methods without an indirect layer, and why.
-NO_LIGHT = {"ambient-occlusion": "its picture is occlusion, not light"}
+NO_LIGHT = {
+    "ambient-occlusion": "its picture is occlusion, not light",
+    "temporal-light-field": "it reconstructs the whole picture, not its indirect light",
+}
 
 #: Name -> maker of a contender that needs more than the library; an ImportError or ValueError says what is missing.
 PEERS: dict[str, Callable[[], Contender]] = {

@@ -21,6 +21,7 @@ class SplatTree:
         hits, normals, radiance: of all samples, vec3 arrays on the device.
         splats: which samples are splats, int array on the host.
         noise: rounding of the positions.
+        order: what `order` shall be; None: along a Hilbert curve.
 
     Attributes:
         struct: what kernels see.
@@ -35,12 +36,13 @@ class SplatTree:
         radiance: wp.array,
         splats: np.ndarray,
         noise: float,
+        order: wp.array | None = None,
     ) -> None:
         self.device = device
         self.noise = noise
         self.count = len(splats)
         self.block_count = max(1, -(-self.count // LANES))  # of an empty tree all lanes are unused
-        self.order = hilbert_order(device, hits, splats)
+        self.order = hilbert_order(device, hits, splats) if order is None else order
         self.levels, first = tree_levels(self.block_count)
         self.node_count = len(first)
         struct = SplatTreeStruct()
@@ -59,13 +61,22 @@ class SplatTree:
         arrays = (self.struct.nodes, self.struct.first, self.struct.blocks, self.order)
         return sum(array.capacity for array in arrays)
 
-    def refit(self, balls: bool = False) -> None:
-        """Boxes from the splats' present sizes, as discs or as balls, level by level."""
+    def refit(self) -> None:
+        """Boxes from the splats' present sizes, as discs."""
+        self._refit(flat=1.0)
+
+    def refit_as_balls(self) -> None:
+        """The same as balls."""
+        self._refit(flat=0.0)
+
+    def _refit(self, flat: float) -> None:
         start, size = self.levels[0]
         blocks, nodes = self.struct.blocks, self.struct.nodes
-        self.device.launch(
-            bvh.fit_leaves, size, [blocks, self.block_count, start, self.noise, float(not balls)], [nodes]
-        )
+        self.device.launch(bvh.fit_leaves, size, [blocks, self.block_count, start, self.noise, flat], [nodes])
+        self.fit_levels(nodes)
+
+    def fit_levels(self, nodes: wp.array) -> None:
+        """Boxes of all levels above the lowest, level by level."""
         for (start, size), (below, count_below) in zip(self.levels[1:], self.levels, strict=False):
             self.device.launch(bvh.fit_level, size, [start, below, count_below], [nodes])
 

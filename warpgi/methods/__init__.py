@@ -9,6 +9,7 @@ from warpgi.film import Film
 from warpgi.job import Job
 from warpgi.methods.a_trous import ATrous
 from warpgi.methods.ambient_occlusion import AmbientOcclusion
+from warpgi.methods.instant_radiosity import InstantRadiosity, NearLight
 from warpgi.methods.irradiance_filter import IrradianceFilter
 from warpgi.methods.light_field import LightField
 from warpgi.methods.path import PathTracing, Sampler
@@ -75,6 +76,7 @@ METHODS: dict[str, type] = {
     "random-parameter-filter": RandomParameterFilter,
     "irradiance-filter": IrradianceFilter,
     "photon-map": PhotonMap,
+    "instant-radiosity": InstantRadiosity,
     "temporal-light-field": TemporalLightField,
 }
 
@@ -93,10 +95,12 @@ __all__ = [
     "ATrous",
     "AmbientOcclusion",
     "FrameMethod",
+    "InstantRadiosity",
     "IrradianceFilter",
     "Kernel",
     "LightField",
     "Method",
+    "NearLight",
     "PathTracing",
     "PhotonMap",
     "RandomParameterFilter",
