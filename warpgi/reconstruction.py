@@ -75,6 +75,7 @@ class Reconstruction:
         seed: which reconstruction rays.
         hits: where light is gathered; None: at the samples' own primary hits.
         reach: distance within which a surface counts as near, for ambient occlusion.
+        with_distance: keep what `inverse_distance` needs.
 
     Raises:
         ValueError: the samples hold no secondary rays, or do not fit into the device's memory limit.
@@ -90,6 +91,7 @@ class Reconstruction:
         reach: float = np.inf,
         recursions: int = 0,
         recursive_rays: int = 16,
+        with_distance: bool = False,
     ) -> None:
         if not samples.has_secondary_rays:
             raise ValueError("samples hold no secondary rays, expected a sample buffer of format 2.0 or newer")
@@ -106,13 +108,9 @@ class Reconstruction:
         self._upload(splats, hits)
         is_primary = state.is_primary if hits is None else np.abs(hits.origin).max(axis=1) < NO_HIT
         self.primary = np.flatnonzero(is_primary).astype(np.int32)
-        self.tree = SplatTree(device, self._hits, self._hit_normals, self._radiance, splats, self.noise)
-        rays = kernels.Rays()
-        rays.origins, rays.hits, rays.order = self._origins, self._hits, self.tree.order
-        self.rays, self.preprocessing = rays, preprocessing
-        self.tree.size_by_neighbours(rays, preprocessing.neighbours, preprocessing.alpha)
+        self.preprocessing = preprocessing
         self.escaped = np.flatnonzero(state.is_escaped).astype(np.int32)
-        self.tree.shrink(rays, preprocessing.margin, self.escaped, self.extent)
+        self._make_tree(splats)
         self.sky = make_sky(samples, self.escaped, device)
         self.counts = {name: count for name, count in state.counts.items() if name != "primary_missed"}
         self.counts |= {"splats": len(splats), "reconstruction_rays": 0}
@@ -121,6 +119,7 @@ class Reconstruction:
         per_pixel = samples.spp if hits is None else hits.per_pixel
         self._receivers = self._make_receivers(self.primary, self._receiver_origins, self._receiver_normals, per_pixel)
         self._gathered = self._make_gathered(len(self.primary))
+        self._gathered.inverse_distance = device.zeros(len(self.primary) if with_distance else 0, float)
         self.rays_done = 0
 
     def gather(self, first: int, count: int, each: int) -> None:
@@ -133,6 +132,20 @@ class Reconstruction:
         result = self.device.zeros(self._receiver_albedo.size, wp.vec3)
         inputs = [self._receivers, self._gathered, self.rays_done, self._receiver_albedo]
         self.device.launch(kernels.reflect, len(self.primary), inputs, [result])
+        return result
+
+    def incident(self) -> np.ndarray:
+        """Light that falls on each primary hit, irradiance over pi, shape (M, 3); 0 for rows without one."""
+        result = np.zeros((self._receiver_albedo.size, 3), np.float32)
+        known = self.rays_done - self._gathered.counts.numpy()[:, 0]
+        result[self.primary] = self._gathered.radiance.numpy() / np.maximum(known, 1)[:, None]
+        return result
+
+    def inverse_distance(self) -> np.ndarray:
+        """Mean over each primary hit's rays of one over their length, shape (M,); the sky's counts as 0."""
+        result = np.zeros(self._receiver_albedo.size, np.float32)
+        known = self.rays_done - self._gathered.counts.numpy()[:, 0]
+        result[self.primary] = self._gathered.inverse_distance.numpy() / np.maximum(known, 1)
         return result
 
     def near(self) -> np.ndarray:
@@ -169,6 +182,15 @@ class Reconstruction:
         self._receiver_normals = device.array(receivers.normal, wp.vec3)
         self._receiver_albedo = device.array(receivers.albedo, wp.vec3)
 
+    def _make_tree(self, splats: np.ndarray) -> None:
+        """Splats of the size that their neighbours and the input rays leave them."""
+        self.tree = SplatTree(self.device, self._hits, self._hit_normals, self._radiance, splats, self.noise)
+        rays = kernels.Rays()
+        rays.origins, rays.hits, rays.order = self._origins, self._hits, self.tree.order
+        self.rays = rays
+        self.tree.size_by_neighbours(rays, self.preprocessing.neighbours, self.preprocessing.alpha)
+        self.tree.shrink(rays, self.preprocessing.margin, self.escaped, self.extent)
+
     def _make_receivers(
         self, sample: np.ndarray, origins: wp.array, normals: wp.array, per_pixel: int
     ) -> kernels.Receivers:
@@ -194,11 +216,15 @@ class Reconstruction:
         self, receivers: kernels.Receivers, gathered: kernels.Gathered, size: int, first: int, count: int, each: int
     ) -> None:
         inputs = [self.tree.struct, self.sky, receivers, each, first, count, self.seed, self.noise, self.reach]
-        lone = self.preprocessing.lone_radius
-        # half the radius for one means two thirds for two
-        inputs += [lone**2, (1.0 - (1.0 - lone) * 2.0 / 3.0) ** 2]
+        inputs += self._kept_parts()
         self.device.launch(kernels.reconstruct, size, inputs, [gathered])
         self.counts["reconstruction_rays"] += size * count
+
+    def _kept_parts(self) -> list[float]:
+        """Squared parts of their radius that one splat alone, and two, keep in the first surface."""
+        lone = self.preprocessing.lone_radius
+        # half the radius for one means two thirds for two
+        return [lone**2, (1.0 - (1.0 - lone) * 2.0 / 3.0) ** 2]
 
     def _relight(self, splats: np.ndarray, rays: int) -> None:
         """Recursive filtering (section 4): the splats' own light, reconstructed, replaces what one path brought."""
