@@ -130,6 +130,7 @@ class Gathered:
 
     radiance: wp.array[wp.vec3]
     near: wp.array[float]  # rays that met a surface within reach
+    inverse_distance: wp.array[float]  # one over the length of each ray, 0 to the sky; empty where nobody asked
     counts: wp.array[wp.vec4i]  # rays without support, to the sky, cut short; undersampled surfaces passed through
 
 
@@ -164,6 +165,7 @@ def reconstruct(
         place = receivers.places[j]
     total = gathered.radiance[i]
     near = gathered.near[i]
+    inverse = float(0.0)
     counts = gathered.counts[i]
     for ray in range(first_ray, first_ray + ray_count):
         # one sequence a pixel, cut into the shares of its samples
@@ -185,10 +187,14 @@ def reconstruct(
             counts[1] = counts[1] + 1
         else:
             counts[0] = counts[0] + 1
+        if s[3] > 0.0:
+            inverse = inverse + s[3] / wp.max(s[9], 1.0e-20)
         counts[2] = counts[2] + int(s[6])
         counts[3] = counts[3] + int(s[7])
     gathered.radiance[i] = total
     gathered.near[i] = near
+    if gathered.inverse_distance.shape[0] > 0:
+        gathered.inverse_distance[i] = gathered.inverse_distance[i] + inverse
     gathered.counts[i] = counts
 
 
