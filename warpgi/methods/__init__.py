@@ -15,6 +15,7 @@ from warpgi.methods.light_field import LightField
 from warpgi.methods.path import PathTracing, Sampler
 from warpgi.methods.photon_map import Kernel, PhotonMap
 from warpgi.methods.random_parameter_filter import RandomParameterFilter
+from warpgi.methods.statistical_filter import StatisticalFilter
 from warpgi.methods.temporal_light_field import TemporalLightField
 
 
@@ -79,6 +80,9 @@ METHODS: dict[str, type] = {
     "temporal-light-field": TemporalLightField,
 }
 
+#: Methods of whole sequences, which `render_animation` takes and `render` does not.
+SEQUENCE_METHODS: dict[str, type] = {"statistical-filter": StatisticalFilter}
+
 #: Those that make a picture of a sample buffer alone, and those that filter the layers of a finished one.
 RECONSTRUCTIONS = {name: kind for name, kind in METHODS.items() if hasattr(kind, "layers")}
 DENOISERS = {name: kind for name, kind in METHODS.items() if hasattr(kind, "on_layers")}
@@ -87,6 +91,7 @@ __all__ = [
     "DENOISERS",
     "METHODS",
     "RECONSTRUCTIONS",
+    "SEQUENCE_METHODS",
     "ATrous",
     "AmbientOcclusion",
     "FrameMethod",
@@ -100,5 +105,6 @@ __all__ = [
     "PhotonMap",
     "RandomParameterFilter",
     "Sampler",
+    "StatisticalFilter",
     "TemporalLightField",
 ]
