@@ -91,7 +91,7 @@ def test_paths_whose_light_is_blocked_are_replaced():
     kept = KeptPaths(source, 200, 1)
     before = {int(path["key"]): path for path in kept.paths}
     # at half the height: it hides floor from -1 to 1 along x, 0 to 2 along z
-    moved = dataclasses.replace(board, vertices=board.vertices + (4.5, 0.5, 0.0))
+    moved = dataclasses.replace(board, vertices=np.add(board.vertices, (4.5, 0.5, 0.0)))
     half = np.array([(-0.5, 0.5, 0.0), (0.5, 0.5, 0.0), (0.5, 0.5, 1.0), (-0.5, 0.5, 1.0)])
     np.testing.assert_allclose(moved.vertices, half)
     after = kept.advance(source_of(gi.Scene([FLOOR, moved], CAMERA, light)), budget=1000)

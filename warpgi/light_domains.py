@@ -83,9 +83,7 @@ class Domain:
         s, t = frame(np.broadcast_to(self.direction, (len(aim), 3)))
         return s * (sin * np.cos(phi))[:, None] + t * (sin * np.sin(phi))[:, None] + self.direction * cos[:, None]
 
-    def aim_at(
-        self, face: np.ndarray, u: np.ndarray, p: np.ndarray, far: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def aim_at(self, face: np.ndarray, u: np.ndarray, p: np.ndarray, far: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The aims of paths that reach points p, or that go along p where `far`, and which there can be."""
         if self.position is None and self.triangles is None:
             d = self._parallel(u)

@@ -13,11 +13,11 @@ import warp as wp
 from warpgi import checks
 from warpgi.film import Film
 from warpgi.job import Job
+from warpgi.kept_paths import KeptPaths
 from warpgi.kernels import instant_radiosity as kernels
 from warpgi.kernels import photons as photon_kernels
 from warpgi.kernels import rng
 from warpgi.kernels import vpls as vpl_kernels
-from warpgi.kept_paths import KeptPaths
 from warpgi.materials import Coated, Conductor, Dielectric, Mirror
 from warpgi.methods.path import Sampler
 from warpgi.photons import BATCH_BYTES, PHOTON_BYTES, PhotonSource, Shot
@@ -83,9 +83,9 @@ class InstantRadiosity:
     """Rough metal and coats of this roughness or more are lit by virtual lights and become some; smoother ones are
     followed by rays, in (0, 1]."""
     renewed_paths: int | None = None
-    """In a sequence: paths that are made anew from frame to frame at most. The others are kept, weighted by their Voronoi
-    cells, as long as the moved light reaches what they met (Laine et al. 2007), so that pictures do not flicker; nor do
-    the camera's random numbers change. None: each frame has a set of its own."""
+    """In a sequence: paths that are made anew from frame to frame at most. The others are kept, weighted by their
+    Voronoi cells, as long as the moved light reaches what they met (Laine et al. 2007), so that nothing flickers;
+    nor do the camera's random numbers change. None: each frame has a set of its own."""
     light_samples: int = 2
     """Shadow rays to lights from each camera path's first surface."""
     sampler: Sampler = Sampler.SOBOL
@@ -99,7 +99,9 @@ class InstantRadiosity:
         if self.renewed_paths is not None:
             checks.count("renewed_paths", self.renewed_paths, 0)
             if self.set_spp is not None:
-                raise ValueError(f"renewed_paths is given, expected None where set_spp is {self.set_spp}: one set is kept")
+                raise ValueError(
+                    f"renewed_paths is given, expected None where set_spp is {self.set_spp}: one set is kept"
+                )
         if not isinstance(self.near_light, NearLight):
             raise TypeError(f"near_light is {self.near_light!r}, expected a NearLight")
         if self.near_distance is not None:
