@@ -11,6 +11,7 @@ from warpgi.methods.a_trous import ATrous
 from warpgi.methods.ambient_occlusion import AmbientOcclusion
 from warpgi.methods.irradiance_filter import IrradianceFilter
 from warpgi.methods.light_field import LightField
+from warpgi.methods.meshless_hierarchy import MeshlessHierarchy
 from warpgi.methods.path import PathTracing, Sampler
 from warpgi.methods.photon_map import Kernel, PhotonMap
 from warpgi.methods.random_parameter_filter import RandomParameterFilter
@@ -75,6 +76,7 @@ METHODS: dict[str, type] = {
     "irradiance-filter": IrradianceFilter,
     "photon-map": PhotonMap,
     "temporal-light-field": TemporalLightField,
+    "meshless-hierarchy": MeshlessHierarchy,
 }
 
 #: Those that make a picture of a sample buffer alone, and those that filter the layers of a finished one.
@@ -91,6 +93,7 @@ __all__ = [
     "IrradianceFilter",
     "Kernel",
     "LightField",
+    "MeshlessHierarchy",
     "Method",
     "PathTracing",
     "PhotonMap",
