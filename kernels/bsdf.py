@@ -196,6 +196,40 @@ def evaluate(shape: ShapeRecord, albedo: wp.vec3, n: wp.vec3, wo: wp.vec3, wi: w
 
 
 @wp.func
+def is_wide(shape: ShapeRecord, exponent: float):
+    """Whether all light is scattered by lobes no sharper than `exponent`."""
+    if shape.kind == CONDUCTOR or shape.kind == COATED:
+        return shape.exponent <= exponent
+    return shape.kind == DIFFUSE
+
+
+@wp.func
+def has_wide_lobe(shape: ShapeRecord, exponent: float):
+    """Whether some is; the base of Coated is such at any exponent."""
+    return shape.kind == COATED or is_wide(shape, exponent)
+
+
+@wp.func
+def wide_share(shape: ShapeRecord, albedo: wp.vec3, n: wp.vec3, wo: wp.vec3, wi: wp.vec3, exponent: float):
+    """Part of the light from wi that comes to wo by lobes no sharper than `exponent`."""
+    if is_wide(shape, exponent):
+        return wp.vec3(1.0)
+    return base_share(shape, albedo, n, wo, wi)
+
+
+@wp.func
+def wide_value(shape: ShapeRecord, albedo: wp.vec3, n: wp.vec3, wo: wp.vec3, wi: wp.vec3, exponent: float):
+    """f cos of these lobes alone."""
+    if shape.kind == COATED and shape.exponent > exponent:
+        if wp.dot(n, wo) <= 0.0 or wp.dot(n, wi) <= 0.0:
+            return wp.vec3(0.0)
+        return base_value(shape, albedo, n, wo, wi)
+    if not has_wide_lobe(shape, exponent):
+        return wp.vec3(0.0)
+    return evaluate(shape, albedo, n, wo, wi)
+
+
+@wp.func
 def pdf(shape: ShapeRecord, n: wp.vec3, wo: wp.vec3, wi: wp.vec3):
     """Density per solid angle with which `sample` returns wi; 0 for delta lobes."""
     cos_i = wp.dot(n, wi)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warpgi.kernels.bsdf import sample
+from warpgi.kernels.bsdf import has_wide_lobe, sample
 from warpgi.kernels.direct import facing_normal, reflects
 from warpgi.kernels.film import is_finite
 from warpgi.kernels.lights import light_probability, pick_light
@@ -15,7 +15,7 @@ from warpgi.kernels.sampling import (
     square_to_triangle,
     to_world,
 )
-from warpgi.kernels.scene import DIELECTRIC, DIFFUSE, Scene, closest_hit, offset_origin, ray_offset, surface_at
+from warpgi.kernels.scene import DIELECTRIC, DIFFUSE, Hit, Scene, closest_hit, offset_origin, ray_offset, surface_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -48,6 +48,7 @@ class Emission:
     radius: float  # of a sphere around the scene
     environment: float  # probability that the environment emits
     caustics: int  # 1: only what reaches a diffuse surface over others; a path ends there
+    sharpest: float  # exponent up to which glossy lobes leave photons too, 0: none do
     aim_cdf: wp.array[float]  # running sum over cells of their probability; empty: all alike
 
 
@@ -57,6 +58,10 @@ class Photons:
     normal: wp.array[wp.vec3]  # of the real surface, on the side that the light came from
     flux: wp.array[wp.vec3]  # [W]
     kind: wp.array[int]  # DIRECT, CAUSTIC or INDIRECT
+    # for those who read them as lights; empty for others
+    face: wp.array[int]
+    bary: wp.array[wp.vec2]  # of the triangle's first and second corner
+    incident: wp.array[wp.vec3]  # towards where the light came from
 
 
 @wp.struct
@@ -182,6 +187,18 @@ def emit(scene: Scene, emission: Emission, sampler: Sampler):
     return beam
 
 
+@wp.func
+def store(photons: Photons, k: int, p: wp.vec3, ng: wp.vec3, flux: wp.vec3, kind: int, hit: Hit, wo: wp.vec3):
+    photons.position[k] = p
+    photons.normal[k] = ng
+    photons.flux[k] = flux
+    photons.kind[k] = kind
+    if photons.face.shape[0] > 0:
+        photons.face[k] = hit.face
+        photons.bary[k] = wp.vec2(hit.u, hit.v)
+        photons.incident[k] = wo
+
+
 @wp.struct
 class Track:
     """What became of one path."""
@@ -236,11 +253,7 @@ def trace_photons(scene: Scene, emission: Emission, path: int, photons: Photons,
                 break
             if wp.max(arrived) > 0.0 and (emission.caustics == 0 or kind == CAUSTIC):
                 if track.stored < room:
-                    k = place + track.stored
-                    photons.position[k] = s.p
-                    photons.normal[k] = ng
-                    photons.flux[k] = arrived
-                    photons.kind[k] = kind
+                    store(photons, place + track.stored, s.p, ng, arrived, kind, hit, wo)
                 track.stored = track.stored + 1
             if emission.caustics != 0:
                 break
@@ -250,6 +263,10 @@ def trace_photons(scene: Scene, emission: Emission, path: int, photons: Photons,
             seen = wp.where(wp.dot(ns, d) > 0.0, ns, ng)
             left = wp.cw_mul(flux, s.albedo) * (wp.max(wp.dot(seen, wo), 0.0) / cos_real)
         else:
+            if emission.sharpest > 0.0 and has_wide_lobe(shape, emission.sharpest) and is_finite(flux):
+                if track.stored < room:
+                    store(photons, place + track.stored, s.p, s.ng * wp.sign(wp.dot(s.ng, wo)), flux, kind, hit, wo)
+                track.stored = track.stored + 1
             if kind == DIRECT:
                 kind = int(CAUSTIC)
             b = sample(shape, s.albedo, n, wo, sample_2d(sampler, pair))
@@ -322,3 +339,7 @@ def pack(
         photons.normal[start + j] = batch.normal[i * slots + j]
         photons.flux[start + j] = batch.flux[i * slots + j]
         photons.kind[start + j] = batch.kind[i * slots + j]
+        if photons.face.shape[0] > 0:
+            photons.face[start + j] = batch.face[i * slots + j]
+            photons.bary[start + j] = batch.bary[i * slots + j]
+            photons.incident[start + j] = batch.incident[i * slots + j]

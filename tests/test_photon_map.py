@@ -253,11 +253,15 @@ def test_pictures_do_not_depend_on_threads_or_memory():
         np.testing.assert_array_equal(one.image, other.image)
 
 
-@pytest.mark.parametrize("name", ["path", "photon-map"])
+@pytest.mark.parametrize("name", ["path", "photon-map", "instant-radiosity"])
 def test_a_resumed_render_equals_one_run(tmp_path, monkeypatch, name):
     """Stopped by Ctrl-C, in the middle of a map, and gone on from the checkpoint: the same picture, bit for bit."""
     scene = caustic()
-    method = gi.PathTracing(spp=12) if name == "path" else gi.PhotonMap(**SMALL, spp=12, map_spp=5)
+    method = {
+        "path": gi.PathTracing(spp=12),
+        "photon-map": gi.PhotonMap(**SMALL, spp=12, map_spp=5),
+        "instant-radiosity": gi.InstantRadiosity(paths=16, spp=12, set_spp=5),
+    }[name]
     whole = gi.render(scene, method, (16, 16), device="cpu")
     path = tmp_path / "half.npz"
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -10,6 +12,7 @@ import warp as wp
 from warpgi import checks
 from warpgi.device import Device
 from warpgi.film import Film
+from warpgi.glossy_reconstruction import GlossyReconstruction
 from warpgi.job import Job
 from warpgi.kernels.light_field import add_reflected
 from warpgi.kernels.primary_samples import trace_primary_samples
@@ -37,8 +40,8 @@ AnyReconstruction = Reconstruction | LensReconstruction
 class LightField:
     """Indirect light reconstructed from a few path-traced samples per pixel (Lehtinen et al. 2012).
 
-    Reconstructs what diffuse surfaces reflect; what others do keeps its path-traced light. `gi.reconstruct` uses it on
-    a sample buffer alone, where the fields that say how samples are traced mean nothing.
+    Reconstructs what diffuse and glossy surfaces reflect; mirrors and glass keep their path-traced light.
+    `gi.reconstruct` uses it on a sample buffer alone, where the fields that say how samples are traced mean nothing.
 
     Raises:
         TypeError, ValueError: a setting is out of range.
@@ -58,6 +61,9 @@ class LightField:
     """Part of its radius that a splat keeps where it alone is the first surface on a ray and others lie behind, in
     (0, 1]; two keep a third less of the difference to 1. The paper takes 0.5 against too much occlusion; measured
     in foliage it lets too much light through, and 1 is nearer to the truth and faster."""
+    bandwidth: bool = True
+    """Read the light of glossy surfaces that secondary rays met from samples of like direction; False takes it for the
+    same in all directions, as diffuse surfaces send it."""
     recursive: int = 0
     """Times that the samples' own light is reconstructed first; cures artefacts of noisy samples in corners."""
     recursive_rays: int = 16
@@ -153,6 +159,7 @@ class LightField:
             self.roulette_depth or NEVER,
             self.sampler,
             with_hit_light=self.recursive > 0,
+            with_gloss=job.scene.scene.is_glossy and not self.photons,
         )
         caustics = light_by_photons(job, self.photons, samples, hits) if self.photons else None
         state = self.reconstruction(samples, job.device, job.seed, hits)
@@ -166,15 +173,13 @@ class LightField:
         """Splats made of a sample buffer, ready for `gather`."""
         if self.primary_rays:
             return LensReconstruction(samples, device, self.preprocessing, seed)
-        return Reconstruction(
-            samples,
-            device,
-            self.preprocessing,
-            seed,
-            hits,
-            recursions=self.recursive,
-            recursive_rays=self.recursive_rays,
-        )
+        bandwidth = self.bandwidth and samples.bandwidth is not None
+        make: Any = Reconstruction
+        if samples.material is not None or bandwidth:
+            make = partial(GlossyReconstruction, bandwidth=bandwidth)
+        how = {"recursions": self.recursive, "recursive_rays": self.recursive_rays}
+        state: Reconstruction = make(samples, device, self.preprocessing, seed, hits, **how)
+        return state
 
     def estimate(self, job: Job, state: AnyReconstruction, film: Film, first: int, count: int) -> None:
         """Sends `count` reconstruction rays from every primary hit."""
