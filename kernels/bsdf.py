@@ -171,6 +171,28 @@ def base_share(shape: ShapeRecord, albedo: wp.vec3, n: wp.vec3, wo: wp.vec3, wi:
 
 
 @wp.func
+def has_base(kind: int):
+    """Whether a surface has a diffuse layer, of which an irradiance says all."""
+    return kind == DIFFUSE or kind == COATED
+
+
+@wp.func
+def base_entry(shape: ShapeRecord, n: wp.vec3, wi: wp.vec3):
+    """Part of the light from wi that comes to the diffuse layer, which reflects it by `base_reflectance`."""
+    if shape.kind == COATED:
+        return (1.0 - coat_albedo(shape, wp.dot(n, wi))) * shape.coat[1]
+    return 1.0
+
+
+@wp.func
+def base_reflectance(shape: ShapeRecord, albedo: wp.vec3, n: wp.vec3, wo: wp.vec3):
+    """pi times the radiance towards wo that the diffuse layer makes of each unit of irradiance that came to it."""
+    if shape.kind == COATED:
+        return base_albedo(shape, albedo) * (1.0 - coat_albedo(shape, wp.dot(n, wo)))
+    return albedo
+
+
+@wp.func
 def coat_probability(shape: ShapeRecord, cos_o: float):
     """Chance that the coat of Coated is sampled, as if its base reflected half of what it gets."""
     e = coat_albedo(shape, cos_o)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warpgi.kernels.bsdf import has_wide_lobe, sample
+from warpgi.kernels.bsdf import base_entry, base_share, has_base, has_wide_lobe, sample
 from warpgi.kernels.direct import facing_normal, reflects
 from warpgi.kernels.film import is_finite
 from warpgi.kernels.lights import light_probability, pick_light
@@ -15,11 +15,21 @@ from warpgi.kernels.sampling import (
     square_to_triangle,
     to_world,
 )
-from warpgi.kernels.scene import DIELECTRIC, DIFFUSE, Hit, Scene, closest_hit, offset_origin, ray_offset, surface_at
+from warpgi.kernels.scene import (
+    COATED,
+    DIELECTRIC,
+    DIFFUSE,
+    Hit,
+    Scene,
+    closest_hit,
+    offset_origin,
+    ray_offset,
+    surface_at,
+)
 
 wp.set_module_options({"enable_backward": False})
 
-# How light came to a photon's place; S is any surface that is not diffuse.
+# How light came to a photon's place; D is a diffuse surface or the base of a coated one, S any other.
 DIRECT = wp.constant(0)  # L D
 CAUSTIC = wp.constant(1)  # L S+ D
 INDIRECT = wp.constant(2)  # any other
@@ -242,12 +252,12 @@ def trace_photons(scene: Scene, emission: Emission, path: int, photons: Photons,
         pair = EMISSION_PAIRS + SCATTER_PAIRS * depth
         left = wp.vec3(0.0)
         d = wp.vec3(0.0)
-        if shape.kind == DIFFUSE:
-            # the sides of the normals that the light came to
-            side = wp.sign(wp.dot(s.ng, wo))
-            ng = s.ng * side
-            ns = s.n * side
-            arrived = flux * (wp.max(wp.dot(ns, wo), 0.0) / cos_real)
+        # the sides of the normals that the light came to
+        side = wp.sign(wp.dot(s.ng, wo))
+        ng = s.ng * side
+        ns = s.n * side
+        if shape.kind == DIFFUSE or (emission.sharpest == 0.0 and has_base(shape.kind)):
+            arrived = flux * (wp.max(wp.dot(ns, wo), 0.0) / cos_real * base_entry(shape, n, wo))
             if not is_finite(flux):
                 track.dropped = track.dropped + 1
                 break
@@ -255,6 +265,7 @@ def trace_photons(scene: Scene, emission: Emission, path: int, photons: Photons,
                 if track.stored < room:
                     store(photons, place + track.stored, s.p, ng, arrived, kind, hit, wo)
                 track.stored = track.stored + 1
+        if shape.kind == DIFFUSE:
             if emission.caustics != 0:
                 break
             kind = int(INDIRECT)
@@ -265,10 +276,8 @@ def trace_photons(scene: Scene, emission: Emission, path: int, photons: Photons,
         else:
             if emission.sharpest > 0.0 and has_wide_lobe(shape, emission.sharpest) and is_finite(flux):
                 if track.stored < room:
-                    store(photons, place + track.stored, s.p, s.ng * wp.sign(wp.dot(s.ng, wo)), flux, kind, hit, wo)
+                    store(photons, place + track.stored, s.p, ng, flux, kind, hit, wo)
                 track.stored = track.stored + 1
-            if kind == DIRECT:
-                kind = int(CAUSTIC)
             b = sample(shape, s.albedo, n, wo, sample_2d(sampler, pair))
             cos_shading = wp.abs(wp.dot(n, b.wi))
             if wp.max(b.weight) <= 0.0 or cos_shading == 0.0 or (b.transmitted == 0 and not reflects(s, wo, b.wi)):
@@ -279,6 +288,22 @@ def trace_photons(scene: Scene, emission: Emission, path: int, photons: Photons,
             )
             if b.transmitted != 0:
                 left = left * (b.eta * b.eta)  # radiance shrinks by that where it is refracted, flux does not
+            by_base = int(0)
+            if shape.kind == COATED and emission.sharpest == 0.0:
+                # which of the layers it came from, so that every photon is of one kind
+                share = base_share(shape, s.albedo, n, wo, d)
+                part = (share[0] + share[1] + share[2]) / 3.0
+                if emission.caustics != 0:
+                    left = wp.cw_mul(left, wp.vec3(1.0) - share)
+                elif sample_2d(sampler, pair + 1)[1] < part:
+                    left = wp.cw_mul(left, share) / part
+                    by_base = int(1)
+                else:
+                    left = wp.cw_mul(left, wp.vec3(1.0) - share) / (1.0 - part)
+            if by_base == 1:
+                kind = int(INDIRECT)
+            elif kind == DIRECT:
+                kind = int(CAUSTIC)
 
         # roulette
         survival = wp.min(wp.max(left) / wp.max(flux), 1.0)
