@@ -42,7 +42,7 @@ class Refinement:
     """Of the first level's discs [scene units]."""
     levels: int
     tolerance: float
-    """Coefficient, relative to irradiance, below which no finer points are needed around a point."""
+    """Coefficient, relative to irradiance, below which, and not at which, no finer points are needed around a point."""
     rays: int
     """From each point."""
 
@@ -98,7 +98,7 @@ class MeshlessHierarchy:
         residual = np.where(self.known[points, None], self.light[points] - self.value.numpy()[points], np.float32(0.0))
         self._add(points, residual, support, around)
         self.varies = (
-            points if self.level == 1 else points[self._relative(points, residual) > self.refinement.tolerance]
+            points if self.level == 1 else points[self._relative(points, residual) >= self.refinement.tolerance]
         )
         self.counts["unresolved_points"] = len(self.varies)
 
