@@ -7,7 +7,7 @@ from pathlib import Path
 
 import tyro
 
-from bench import chart, figures, rays, reconstruction, stability
+from bench import animations, chart, figures, rays, reconstruction, stability
 
 BROKEN = 1  # exit status for a method that is worse than its bound
 MISUSE = 2  # exit status for a caller's mistake
@@ -114,6 +114,33 @@ def lens_command(
     figures.lens(out, size, rays, reference_spp, device, json)
 
 
+def animation_command(
+    scene: str = "moving-light",
+    size: tuple[int, int] = (64, 64),
+    spp: int = 32,
+    frames: int | None = None,
+    pairs: int = 5,
+    reference_spp: int = 4096,
+    device: str | None = None,
+    json: Path | None = None,
+    picture: Path | None = None,
+) -> None:
+    """Judge the statistical filter on a sequence: seconds, error and flicker beside 512 samples, a box filter and OIDN.
+
+    Args:
+        scene: Built-in sequence.
+        size: Width and height in pixels.
+        spp: Paths per pixel of the noisy frames.
+        frames: How many frames; as many as the sequence has by default.
+        pairs: Pairs of neighbouring frames at which errors are measured.
+        reference_spp: Paths per pixel of these frames' references.
+        device: cpu, cuda, cuda:0, ...; a GPU if there is one.
+        json: File for the numbers.
+        picture: PNG of basis functions, truncation map and percentVar.
+    """
+    animations.run(animations.Contest(scene, size, spp, frames, pairs, reference_spp, device), json, picture)
+
+
 def chart_command(
     scene: tuple[str, ...] = ("cornell-box", "courtyard"),
     size: tuple[int, int] = (256, 256),
@@ -176,6 +203,7 @@ def main(arguments: list[str] | None = None) -> int:
     app.command(figures_command, name="figures")
     app.command(scaling_command, name="scaling")
     app.command(lens_command, name="lens")
+    app.command(animation_command, name="animation")
     app.command(chart_command, name="chart")
     app.command(stability_command, name="stability")
     try:

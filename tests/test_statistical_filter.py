@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import warpgi as gi
 from warpgi.__main__ import main
 from warpgi.filter_animation import high_share
+from warpgi.image import to_srgb8
 from warpgi.modes import Rule, by_epsilon, noise_edges, percent_var, principal_components
 from warpgi.resampling import trace_pixels
 from warpgi.statistical_filtering import FrameMatrix, Projection
@@ -409,3 +411,26 @@ def test_filter_on_the_command_line(tmp_path, capsys):
         np.testing.assert_array_equal(ours.image, theirs.image)
     assert main(["filter", str(tmp_path / "none-{:02d}.exr")]) == 2
     assert "none-00.exr does not exist" in capsys.readouterr().err
+
+
+def test_preview(tmp_path, capsys):
+    """Noisy, filtered and reference side by side, an animated PNG of as many pictures as frames, at the sequence's
+    speed; animations that do not fit together are refused."""
+    noisy = gi.render_animation(light(3), gi.PathTracing(spp=1), SIZE, device="cpu", out=tmp_path / "n-{:02d}.exr")
+    smooth = gi.filter_animation(noisy, device="cpu")
+    gi.write_preview(tmp_path / "a.png", noisy, smooth, noisy, exposure=1.0)
+    with Image.open(tmp_path / "a.png") as image:
+        assert image.size == (3 * 16 + 2 * 4, 16)
+        assert image.n_frames == 3
+        image.seek(2)
+        assert image.info["duration"] == pytest.approx(1000.0 / 24.0, abs=1.0)
+        shown = np.asarray(image.convert("RGB"))
+    np.testing.assert_array_equal(shown[:, 20:36], to_srgb8(smooth[2].image, 1.0)[0])
+    np.testing.assert_array_equal(shown[:, 40:], to_srgb8(noisy[2].image, 1.0)[0])
+    with pytest.raises(ValueError, match="have 3, 1 frames"):
+        gi.write_preview(tmp_path / "b.png", noisy, gi.Animation([noisy[0]], (0,)))
+    files = str(tmp_path / "n-{:02d}.exr")
+    out = ["--out", str(tmp_path / "f" / "f-{:02d}.exr"), "--device", "cpu"]
+    assert main(["filter", files, *out, "--reference", files, "--preview", str(tmp_path / "c.png")]) == 0
+    with Image.open(tmp_path / "c.png") as image:
+        assert (image.size, image.n_frames) == ((56, 16), 3)
