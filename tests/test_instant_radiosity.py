@@ -321,7 +321,7 @@ def test_shadow_maps_agree_with_shadow_rays():
 
 
 def test_shadow_maps_do_not_shadow_flat_walls():
-    """Between a floor and a ceiling lights see all that faces them: pixels equal those of shadow rays at any resolution.
+    """Between floor and ceiling lights see all that faces them: pixels are those of shadow rays at any resolution.
 
     Where walls meet, a texel that sees the one wall hides a strip as wide of the other.
     """
