@@ -42,6 +42,8 @@ class Preprocessing:
     """Part of an input ray's length, at either end, in which a crossed splat is not shrunk (2.3.1)."""
     lone_radius: float
     """Part of its radius that a splat keeps where it is alone in the first surface (2.5)."""
+    shrink: bool = True
+    """Whether splats that input rays cross shrink (2.3.1)."""
 
 
 @dataclass(frozen=True)
@@ -189,7 +191,8 @@ class Reconstruction:
         rays.origins, rays.hits, rays.order = self._origins, self._hits, self.tree.order
         self.rays = rays
         self.tree.size_by_neighbours(rays, self.preprocessing.neighbours, self.preprocessing.alpha)
-        self.tree.shrink(rays, self.preprocessing.margin, self.escaped, self.extent)
+        if self.preprocessing.shrink:
+            self.tree.shrink(rays, self.preprocessing.margin, self.escaped, self.extent)
 
     def _make_receivers(
         self, sample: np.ndarray, origins: wp.array, normals: wp.array, per_pixel: int
