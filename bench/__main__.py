@@ -67,51 +67,28 @@ def scaling_command(
 
 
 def figures_command(
-    out: Path,
-    scene: str = "cornell-box",
-    methods: tuple[str, ...] = ("light-field",),
-    size: tuple[int, int] = (256, 256),
-    spp: int = 8,
-    rays: int = 256,
-    reference_spp: int = 1024,
-    exposure: float = 0.0,
+    figure: tuple[str, ...] = (),
+    size: tuple[int, int] | None = None,
+    quick: bool = False,
+    out: Path = Path("out/figures"),
+    picture: Path | None = None,
+    fresh: bool = False,
     device: str | None = None,
 ) -> None:
-    """Picture of the indirect light of a scene: input, methods and reference side by side.
+    """Make the figures of Lehtinen et al. 2012 on scenes of ours: pictures, differences times two, and numbers.
+
+    Ctrl-C keeps what is finished; the same command does what is missing.
 
     Args:
-        out: PNG to write.
-        scene: Built-in scene, or mitsuba-cornell-box: Mitsuba's own, which Mitsuba samples and path-traces.
-        methods: Methods that work on samples: light-field, a-trous, ...
-        size: Width and height of each panel in pixels.
-        spp: Input samples per pixel.
-        rays: Reconstruction rays per pixel.
-        reference_spp: Paths per pixel of the reference.
-        exposure: Stops by which the picture is brightened.
+        figure: Numbers of the paper, 1, 4 and 7 to 13, or mitsuba: Mitsuba's own Cornell box; all numbers by default.
+        size: Width and height of each panel in pixels, instead of the figure's own.
+        quick: A sixteenth of the pixels, 32 rays, and references of 64 spp.
+        out: Folder for a PNG, JSON and NPZ (the panels) of each figure.
+        picture: Where the PNG of a single figure goes too.
+        fresh: Make finished figures anew.
         device: cpu, cuda, cuda:0, ...; a GPU if there is one.
     """
-    figures.side_by_side(out, scene, methods, size, spp, rays, reference_spp, exposure, device)
-
-
-def lens_command(
-    out: Path,
-    size: tuple[int, int] = (640, 360),
-    rays: int = 192,
-    reference_spp: int = 1024,
-    device: str | None = None,
-    json: Path | None = None,
-) -> None:
-    """Picture of defocus and motion: 1 spp of butterflies, both methods that reconstruct from it, and the reference.
-
-    Args:
-        out: PNG to write.
-        size: Width and height of each panel in pixels.
-        rays: Reconstruction rays per pixel.
-        reference_spp: Paths per pixel of the reference.
-        device: cpu, cuda, cuda:0, ...; a GPU if there is one.
-        json: File for the numbers.
-    """
-    figures.lens(out, size, rays, reference_spp, device, json)
+    figures.run(figure, out, size, quick, device, picture, fresh)
 
 
 def animation_command(
@@ -202,7 +179,6 @@ def main(arguments: list[str] | None = None) -> int:
     app.command(rays_command, name="rays")
     app.command(figures_command, name="figures")
     app.command(scaling_command, name="scaling")
-    app.command(lens_command, name="lens")
     app.command(animation_command, name="animation")
     app.command(chart_command, name="chart")
     app.command(stability_command, name="stability")

@@ -12,7 +12,15 @@ from rich.table import Table
 
 import warpgi as gi
 from bench.chart_page import PAGE, RESULTS, STABILITY, write_page
-from bench.failures import ambient_occlusion, instant_radiosity, light_field, path, photon_map, statistical_filter
+from bench.failures import (
+    ambient_occlusion,
+    instant_radiosity,
+    light_field,
+    meshless_hierarchy,
+    path,
+    photon_map,
+    statistical_filter,
+)
 from bench.failures.failure import Failure
 from bench.report import circumstances, finite, progress
 from warpgi.image import atomic_write
@@ -21,6 +29,7 @@ from warpgi.image import atomic_write
 FAILURES: tuple[Failure, ...] = (
     *path.ROWS,
     *light_field.ROWS,
+    *meshless_hierarchy.ROWS,
     *ambient_occlusion.ROWS,
     *photon_map.ROWS,
     *instant_radiosity.ROWS,

@@ -34,11 +34,14 @@ GLOSS = (
 PRIMARY_BYTES, SECONDARY_BYTES = 12 * len(PRIMARY), 12 * len(SECONDARY + HIT_LIGHT)
 
 
-def path_settings(job: Job, max_depth: int, roulette_depth: int, sampler: Sampler) -> PathSettings:
+def path_settings(
+    job: Job, max_depth: int, roulette_depth: int, sampler: Sampler, with_layers: bool = False
+) -> PathSettings:
     """Settings of the kernels that trace samples."""
     settings = PathSettings()
     settings.max_depth, settings.roulette_depth, settings.seed = max_depth, roulette_depth, job.seed
     settings.sampler = int(rng.SOBOL if sampler is Sampler.SOBOL else rng.INDEPENDENT)
+    settings.layers = int(with_layers)
     return settings
 
 
@@ -77,7 +80,8 @@ def trace_sample_buffer(
             setattr(arrays, name, device.zeros(count, dtype))
     for band in film.bands:
         arrays.first_pixel = band.start
-        inputs = [job.scene.struct, job.camera, path_settings(job, max_depth, roulette_depth, sampler), light_samples]
+        settings = path_settings(job, max_depth, roulette_depth, sampler, with_gloss)
+        inputs = [job.scene.struct, job.camera, settings, light_samples]
         device.launch(trace_samples, len(band), inputs, [film.load(band), arrays])
     # on cpu these are the very arrays, which the buffer keeps alive
     values = {name: getattr(arrays, name).numpy() for name in of_hits | of_rays}
