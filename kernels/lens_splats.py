@@ -8,7 +8,7 @@ distance at which the nearest input ray passed it unhindered.
 
 import warp as wp
 
-from warpgi.kernels.splats import SURFACE, SplatTree, vec9
+from warpgi.kernels.splats import SURFACE, SplatTree, vec10
 
 wp.set_module_options({"enable_backward": False})
 
@@ -87,4 +87,4 @@ def lens_surface(
     part2: float,
     slope2: float,
     open: int,
-) -> vec9: ...
+) -> vec10: ...

@@ -10,7 +10,7 @@ from warpgi.kernels.bvh import BLOCK_STRIDE, EMPTY, LANES, RADIUS_ROW, write_box
 from warpgi.kernels.lens import ANY_REACH, Lens, LensSums, lens_ray
 from warpgi.kernels.lens_splats import LENS_SURFACE
 from warpgi.kernels.light_field import FAR, Rays, Sky, sky_radiance
-from warpgi.kernels.splats import SHRINK, SplatTree, vec9
+from warpgi.kernels.splats import SHRINK, SplatTree, vec10
 
 wp.set_module_options({"enable_backward": False})
 
@@ -72,7 +72,7 @@ def lens_surface_moving(
     part2: float,
     slope2: float,
     open: int,
-) -> vec9: ...
+) -> vec10: ...
 
 
 @wp.struct

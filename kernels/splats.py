@@ -12,7 +12,7 @@ wp.set_module_options({"enable_backward": False})
 
 MAX_NEIGHBOURS = 32  # the length of the arrays in NEAREST
 
-vec9 = wp.types.vector(length=9, dtype=wp.float32)
+vec10 = wp.types.vector(length=10, dtype=wp.float32)
 
 
 @wp.struct
@@ -260,8 +260,8 @@ def shrink_crossed(
 # authors' erratum); that is a b depth_i depth_j > 0 for a = (h_j - h_i).n_i and b = (h_j - h_i).n_j.
 # `keep_one` and `keep_two` are squared parts of their radius that splats keep which are alone, or two, in the surface.
 # Returns radiance times weight (3), weight, weight of splats nearer than `reach`, splats in the surface, whether
-# the gather was cut short, how many undersampled surfaces were passed through, and the distance of a surface whose
-# splats all face away, else 0.
+# the gather was cut short, how many undersampled surfaces were passed through, the distance of a surface whose
+# splats all face away, else 0, and the surface's weighted distance times weight.
 SURFACE = (
     WALK_HEAD
     + """
@@ -391,7 +391,7 @@ SURFACE = (
     bool any_front = false;
     for (int j = 0; j < size; ++j)
         any_front = any_front | ((t_of[j] < limit) & (place[j] >= 0));
-    float r = 0.0f, g = 0.0f, b = 0.0f, weight = 0.0f, within = 0.0f;
+    float r = 0.0f, g = 0.0f, b = 0.0f, weight = 0.0f, within = 0.0f, distance = 0.0f;
     for (int j = 0; j < size; ++j) {
         // splats seen from behind give radiance only where all of the surface is (section 2.5)
         if (t_of[j] < limit && (place[j] >= 0) == any_front) {
@@ -403,6 +403,7 @@ SURFACE = (
             b += w * q[72];
             weight += w;
             within += t_of[j] < reach ? w : 0.0f;
+            distance += w * t_of[j];
         }
     }
     float seen_behind = 0.0f;
@@ -411,10 +412,10 @@ SURFACE = (
         for (int j = 0; j < size; ++j)
             seen_behind = smaller(seen_behind, t_of[j]);
     }
-    wp::vec_t<9, wp::float32> result;
+    wp::vec_t<10, wp::float32> result;
     result[0] = r; result[1] = g; result[2] = b; result[3] = weight; result[4] = within;
     result[5] = (float)inside; result[6] = (float)cut; result[7] = (float)surfaces_passed;
-    result[8] = seen_behind;
+    result[8] = seen_behind; result[9] = distance;
     return result;
 """
 )
@@ -423,7 +424,7 @@ SURFACE = (
 @wp.func_native(SURFACE)
 def first_surface(
     tree: SplatTree, o: wp.vec3, d: wp.vec3, noise: float, reach: float, keep_one: float, keep_two: float
-) -> vec9: ...
+) -> vec10: ...
 
 
 # The splat nearest to x among those that face a ray along d; -1 if none does.

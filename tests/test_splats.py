@@ -9,7 +9,7 @@ import warp as wp
 import warpgi as gi
 from warpgi.kernels import light_field as kernels
 from warpgi.kernels.splats import SplatTree as SplatTreeStruct
-from warpgi.kernels.splats import first_surface, nearest_facing, vec9
+from warpgi.kernels.splats import first_surface, nearest_facing, vec10
 from warpgi.reconstruction import NOISE_ULPS
 from warpgi.splat_tree import LANES, SplatTree
 
@@ -33,7 +33,7 @@ def look(
     directions: wp.array[wp.vec3],
     noise: float,
     reach: float,
-    result: wp.array[vec9],
+    result: wp.array[vec10],
 ):
     """One thread owns one ray; splats alone, or two, keep 1/2 and 2/3 of their radius, as in section 2.5."""
     i = offset + wp.tid()
@@ -65,7 +65,7 @@ class Splats:
 
     def set_radii(self, radii):
         radii = np.broadcast_to(np.asarray(radii, dtype=np.float32), len(self.hits))
-        self.tree._set_radii(self.device.array((radii * radii)[self.order], float), 1)
+        self.tree.set_radius2(self.device.array((radii * radii)[self.order], float))
 
     def radii(self):
         """In the order of the samples."""
@@ -80,10 +80,11 @@ class Splats:
         return rays
 
     def look(self, origins, directions, reach=1e30):
-        """Radiance, weight, weight within reach, splats, cut gathers, surfaces passed, where all face away: (N, 9)."""
+        """Radiance, weight, weight within reach, splats, cut gathers, surfaces passed, where all face away,
+        distance times weight: (N, 10)."""
         origins = np.asarray(origins, dtype=np.float32).reshape(-1, 3)
         directions = unit(np.asarray(directions, dtype=np.float64).reshape(-1, 3)).astype(np.float32)
-        result = self.device.zeros(len(origins), vec9)
+        result = self.device.zeros(len(origins), vec10)
         arrays = [self.device.array(x, wp.vec3) for x in (origins, directions)]
         self.device.launch(look, len(origins), [self.tree.struct, *arrays, self.noise, reach], [result])
         return result.numpy().astype(np.float64)

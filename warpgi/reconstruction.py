@@ -14,6 +14,7 @@ import warp as wp
 from warpgi.device import Device
 from warpgi.kernels import bvh
 from warpgi.kernels import light_field as kernels
+from warpgi.kernels.hemisphere import Hemispheres
 from warpgi.samples import NO_HIT, SampleBuffer
 from warpgi.splat_tree import SplatTree
 
@@ -118,8 +119,11 @@ class Reconstruction:
         self.counts |= {"splats": len(splats), "reconstruction_rays": 0}
         for _ in range(recursions):
             self._relight(splats, recursive_rays)
-        per_pixel = samples.spp if hits is None else hits.per_pixel
-        self._receivers = self._make_receivers(self.primary, self._receiver_origins, self._receiver_normals, per_pixel)
+        self._per_pixel = samples.spp if hits is None else hits.per_pixel
+        self._receivers = self._make_receivers(
+            self.primary, self._receiver_origins, self._receiver_normals, self._per_pixel
+        )
+        self._found = np.zeros(4, np.int64)  # beside what `_gathered` counts
         self._gathered = self._make_gathered(len(self.primary))
         self.rays_done = 0
 
@@ -135,6 +139,24 @@ class Reconstruction:
         self.device.launch(kernels.reflect, len(self.primary), inputs, [result])
         return result
 
+    def fill_strata(self, hemispheres: Hemispheres, strata: wp.array, count: int) -> None:
+        """Sends a ray into each stratum of `count` hemispheres, whose points are relative to `centre`."""
+        counts = self.device.zeros(count, wp.vec4i)
+        inputs = [self.tree.struct, self.sky, hemispheres, self.seed, self.noise, *self._keep()]
+        self.device.launch(kernels.reconstruct_strata, count, inputs, [strata, counts])
+        self.counts["reconstruction_rays"] += len(strata)
+        self._found += counts.numpy().sum(axis=0, dtype=np.int64)
+
+    def irradiance_at(self, hits: np.ndarray, rays: int) -> wp.array:
+        """Irradiance at some of the primary hits from `rays` rays each, vec3 on the device."""
+        receivers = self._make_receivers(hits, self._receiver_origins, self._receiver_normals, self._per_pixel)
+        gathered = self._make_gathered(len(hits))
+        self._trace(receivers, gathered, len(hits), 0, rays, rays)
+        result = self.device.zeros(len(hits), wp.vec3)
+        self.device.launch(kernels.gathered_irradiance, len(hits), [gathered, rays], [result])
+        self._found += gathered.counts.numpy().sum(axis=0, dtype=np.int64)
+        return result
+
     def near(self) -> np.ndarray:
         """Share of each sample's rays that met a surface within reach, shape (N,); 0 without a primary hit."""
         result = np.zeros(len(self.samples), np.float32)
@@ -144,7 +166,7 @@ class Reconstruction:
 
     def all_counts(self) -> dict[str, int]:
         """Rays so far, and what was dropped, cut short or without support."""
-        found = self._gathered.counts.numpy().sum(axis=0, dtype=np.int64)
+        found = self._found + self._gathered.counts.numpy().sum(axis=0, dtype=np.int64)
         names = ("missing_support", "sky_rays", "cut_gathers", "undersampled_surfaces")
         return self.counts | dict(zip(names, found.tolist(), strict=True))
 
@@ -153,7 +175,7 @@ class Reconstruction:
         samples, device = self.samples, self.device
         used = samples.hit[splats] if len(splats) else np.zeros((1, 3), np.float32)
         low, high = used.min(axis=0), used.max(axis=0)
-        centre = 0.5 * (low + high)
+        self.centre = centre = 0.5 * (low + high)
         self.extent = float((high - low).max())  # of the splats
         self.noise = NOISE_ULPS * max(float(np.abs(low).max()), float(np.abs(high).max()), 1e-30)
         with np.errstate(invalid="ignore", over="ignore"):
@@ -194,11 +216,15 @@ class Reconstruction:
         self, receivers: kernels.Receivers, gathered: kernels.Gathered, size: int, first: int, count: int, each: int
     ) -> None:
         inputs = [self.tree.struct, self.sky, receivers, each, first, count, self.seed, self.noise, self.reach]
-        lone = self.preprocessing.lone_radius
-        # half the radius for one means two thirds for two
-        inputs += [lone**2, (1.0 - (1.0 - lone) * 2.0 / 3.0) ** 2]
+        inputs += self._keep()
         self.device.launch(kernels.reconstruct, size, inputs, [gathered])
         self.counts["reconstruction_rays"] += size * count
+
+    def _keep(self) -> list[float]:
+        """Squared parts of their radius that one splat and two keep where they are alone in the first surface."""
+        lone = self.preprocessing.lone_radius
+        # half the radius for one means two thirds for two
+        return [lone**2, (1.0 - (1.0 - lone) * 2.0 / 3.0) ** 2]
 
     def _relight(self, splats: np.ndarray, rays: int) -> None:
         """Recursive filtering (section 4): the splats' own light, reconstructed, replaces what one path brought."""

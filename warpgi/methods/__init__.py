@@ -9,6 +9,7 @@ from warpgi.film import Film
 from warpgi.job import Job
 from warpgi.methods.a_trous import ATrous
 from warpgi.methods.ambient_occlusion import AmbientOcclusion
+from warpgi.methods.irradiance_cache import IrradianceCache
 from warpgi.methods.irradiance_filter import IrradianceFilter
 from warpgi.methods.light_field import LightField
 from warpgi.methods.path import PathTracing, Sampler
@@ -58,6 +59,7 @@ METHODS: dict[str, type] = {
     "ambient-occlusion": AmbientOcclusion,
     "a-trous": ATrous,
     "random-parameter-filter": RandomParameterFilter,
+    "irradiance-cache": IrradianceCache,
     "irradiance-filter": IrradianceFilter,
     "photon-map": PhotonMap,
     "temporal-light-field": TemporalLightField,
@@ -73,6 +75,7 @@ __all__ = [
     "RECONSTRUCTIONS",
     "ATrous",
     "AmbientOcclusion",
+    "IrradianceCache",
     "IrradianceFilter",
     "Kernel",
     "LightField",

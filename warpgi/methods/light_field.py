@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from warpgi import checks
+from warpgi.cached_reconstruction import CachedReconstruction
 from warpgi.device import Device
 from warpgi.film import Film
 from warpgi.job import Job
@@ -16,8 +17,11 @@ from warpgi.kernels.primary_samples import trace_primary_samples
 from warpgi.kernels.samples import trace_samples
 from warpgi.kernels.splats import MAX_NEIGHBOURS
 from warpgi.lens_reconstruction import PRIMARY_SAMPLE_BYTES, LensReconstruction
+from warpgi.methods.irradiance_cache import IrradianceCache
 from warpgi.methods.path import NEVER, Sampler, check_paths
 from warpgi.methods.photon_map import PhotonMap, light_by_photons
+from warpgi.record_cache import KERNELS as CACHE_KERNELS
+from warpgi.record_cache import Caching
 from warpgi.reconstruction import (
     BYTES_PER_HIT,
     BYTES_PER_SAMPLE,
@@ -30,7 +34,7 @@ from warpgi.reconstruction import (
 from warpgi.samples import SampleBuffer
 from warpgi.sampling import PRIMARY_BYTES, SECONDARY_BYTES, trace_primary_buffer, trace_sample_buffer
 
-AnyReconstruction = Reconstruction | LensReconstruction
+AnyReconstruction = Reconstruction | CachedReconstruction | LensReconstruction
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,6 +72,13 @@ class LightField:
     photons: int = 0
     """Paths from the lights for a photon map that gives the radiance at secondary hits in place of traced paths: free
     of noise but blurred, with caustics read at the primary hits; 0: none."""
+    cache: bool = False
+    """Gather at the records of an irradiance cache instead of every primary hit, and interpolate between them; `rays`
+    are then those of pixels where the cache would interpolate across too much, such as foliage."""
+    error: float = 0.3
+    """Allowed error of a record (see `IrradianceCache`), with `cache`; time grows about with its inverse square."""
+    record_rays: int = 256
+    """Reconstruction rays of a record, with `cache`."""
     light_samples: int = 32
     """Shadow rays to lights per pixel, shared out over its primary hits, which make the direct light."""
     max_depth: int | None = None
@@ -111,12 +122,19 @@ class LightField:
         """What it launches."""
         if self.primary_rays:
             return (trace_primary_samples,)  # lens reconstruction loads its own, those for motion where it needs them
-        return (trace_samples, *KERNELS, *(PhotonMap().kernels if self.photons else ()))
+        more = (*(PhotonMap().kernels if self.photons else ()), *(CACHE_KERNELS if self.cache else ()))
+        return (trace_samples, *KERNELS, *more)
 
     @property
     def preprocessing(self) -> Preprocessing:
         """How splats are sized."""
         return Preprocessing(self.neighbours, self.alpha, self.margin, self.lone_radius)
+
+    @property
+    def caching(self) -> Caching:
+        """How records are placed."""
+        settings = IrradianceCache(rays=self.record_rays, error=self.error).caching
+        return settings
 
     @property
     def hits(self) -> int:
@@ -127,6 +145,8 @@ class LightField:
         """Reconstruction rays for each primary hit, at `hits` of them in a pixel, and what to call them."""
         if self.primary_rays:
             return self.rays, "rays"
+        if self.cache:
+            return len(self.caching.rounds), "levels"
         return max(1, round(self.rays / (hits or self.hits))), "rays per hit"
 
     def device_bytes(self, size: tuple[int, int]) -> int:
@@ -156,7 +176,7 @@ class LightField:
         )
         caustics = light_by_photons(job, self.photons, samples, hits) if self.photons else None
         state = self.reconstruction(samples, job.device, job.seed, hits)
-        if isinstance(state, Reconstruction):
+        if not isinstance(state, LensReconstruction):
             state.caustics = caustics
         return state
 
@@ -166,7 +186,7 @@ class LightField:
         """Splats made of a sample buffer, ready for `gather`."""
         if self.primary_rays:
             return LensReconstruction(samples, device, self.preprocessing, seed)
-        return Reconstruction(
+        splats = Reconstruction(
             samples,
             device,
             self.preprocessing,
@@ -175,6 +195,7 @@ class LightField:
             recursions=self.recursive,
             recursive_rays=self.recursive_rays,
         )
+        return CachedReconstruction(splats, hits, self.caching, self.rays) if self.cache else splats
 
     def estimate(self, job: Job, state: AnyReconstruction, film: Film, first: int, count: int) -> None:
         """Sends `count` reconstruction rays from every primary hit."""
@@ -189,13 +210,14 @@ class LightField:
             job.device.launch(add_reflected, len(band), [film.load(band), reflected, self.hits])
             if state.caustics is not None:
                 job.device.launch(add_reflected, len(band), [film.load(band), state.caustics, self.hits])
-        return {}
+        return {"records": state.records()} if isinstance(state, CachedReconstruction) else {}
 
     def layers(self, state: AnyReconstruction) -> dict[str, np.ndarray]:
         """The indirect layer of a reconstruction without a scene, or the picture seen through the lens."""
         if isinstance(state, LensReconstruction):
             return {"image": state.image()}
-        return {"indirect": pixel_means(state.samples, state.reflected().numpy())}
+        layers = {"indirect": pixel_means(state.samples, state.reflected().numpy())}
+        return layers | ({"records": state.records()} if isinstance(state, CachedReconstruction) else {})
 
     def counts(self, state: AnyReconstruction) -> dict[str, int]:
         """Reconstruction rays, and what was dropped, cut short or without support."""
