@@ -113,7 +113,7 @@ class Reconstruction:
         self.rays, self.preprocessing = rays, preprocessing
         self.tree.size_by_neighbours(rays, preprocessing.neighbours, preprocessing.alpha)
         self.escaped = np.flatnonzero(state.is_escaped).astype(np.int32)
-        self.tree.shrink(rays, preprocessing.margin, self.escaped, self.extent)
+        self._fit()
         self.sky = make_sky(samples, self.escaped, device)
         self.counts = {name: count for name, count in state.counts.items() if name != "primary_missed"}
         self.counts |= {"splats": len(splats), "reconstruction_rays": 0}
@@ -142,8 +142,7 @@ class Reconstruction:
     def fill_strata(self, hemispheres: Hemispheres, strata: wp.array, count: int) -> None:
         """Sends a ray into each stratum of `count` hemispheres, whose points are relative to `centre`."""
         counts = self.device.zeros(count, wp.vec4i)
-        inputs = [self.tree.struct, self.sky, hemispheres, self.seed, self.noise, *self._keep()]
-        self.device.launch(kernels.reconstruct_strata, count, inputs, [strata, counts])
+        self._send(hemispheres, count, [strata, counts])
         self.counts["reconstruction_rays"] += len(strata)
         self._found += counts.numpy().sum(axis=0, dtype=np.int64)
 
@@ -170,12 +169,24 @@ class Reconstruction:
         names = ("missing_support", "sky_rays", "cut_gathers", "undersampled_surfaces")
         return self.counts | dict(zip(names, found.tolist(), strict=True))
 
+    def _middle(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """The origin of positions, by the splats' bounds."""
+        return 0.5 * (low + high)
+
+    def _fit(self) -> None:
+        """Makes splats ready for rays, once they are sized."""
+        self.tree.shrink(self.rays, self.preprocessing.margin, self.escaped, self.extent)
+
+    def _send(self, hemispheres: Hemispheres, count: int, outputs: list[wp.array]) -> None:
+        inputs = [self.tree.struct, self.sky, hemispheres, self.seed, self.noise, *self._keep()]
+        self.device.launch(kernels.reconstruct_strata, count, inputs, outputs)
+
     def _upload(self, splats: np.ndarray, receivers: PrimaryHits | None) -> None:
         """Positions relative to the splats' centre, so that float32 serves samples far away."""
         samples, device = self.samples, self.device
         used = samples.hit[splats] if len(splats) else np.zeros((1, 3), np.float32)
         low, high = used.min(axis=0), used.max(axis=0)
-        self.centre = centre = 0.5 * (low + high)
+        self.centre = centre = self._middle(low, high)
         self.extent = float((high - low).max())  # of the splats
         self.noise = NOISE_ULPS * max(float(np.abs(low).max()), float(np.abs(high).max()), 1e-30)
         with np.errstate(invalid="ignore", over="ignore"):

@@ -139,6 +139,7 @@ class RecordCache:
         irradiance, reflected = (device.zeros(count, wp.vec3) for _ in range(2))
         uncovered = device.zeros(count, int)
         device.launch(kernels.interpolate, pixels, [self._kernel_records, hits, 0], [irradiance, uncovered])
+        self.last_uncovered = uncovered.numpy()
         alone = np.flatnonzero(uncovered.numpy()).astype(np.int32)
         self.counts["fallback_hits"] = len(alone)
         if len(alone):

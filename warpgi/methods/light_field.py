@@ -10,6 +10,7 @@ import warp as wp
 from warpgi import checks
 from warpgi.cached_reconstruction import CachedReconstruction
 from warpgi.device import Device
+from warpgi.device_scene import DeviceScene
 from warpgi.film import Film
 from warpgi.job import Job
 from warpgi.kernels.light_field import add_reflected
@@ -33,6 +34,8 @@ from warpgi.reconstruction import (
 )
 from warpgi.samples import SampleBuffer
 from warpgi.sampling import PRIMARY_BYTES, SECONDARY_BYTES, trace_primary_buffer, trace_sample_buffer
+from warpgi.traced_reconstruction import KERNELS as TRACED_KERNELS
+from warpgi.traced_reconstruction import TracedReconstruction
 
 AnyReconstruction = Reconstruction | CachedReconstruction | LensReconstruction
 
@@ -77,6 +80,8 @@ class LightField:
     are then those of pixels where the cache would interpolate across too much, such as foliage."""
     error: float = 0.3
     """Allowed error of a record (see `IrradianceCache`), with `cache`; time grows about with its inverse square."""
+    scene_rays: bool = True
+    """With `cache`, and where a scene is at hand: let it stop the rays of records, and splats only light them."""
     record_rays: int = 256
     """Reconstruction rays of a record, with `cache`."""
     light_samples: int = 32
@@ -122,7 +127,7 @@ class LightField:
         """What it launches."""
         if self.primary_rays:
             return (trace_primary_samples,)  # lens reconstruction loads its own, those for motion where it needs them
-        more = (*(PhotonMap().kernels if self.photons else ()), *(CACHE_KERNELS if self.cache else ()))
+        more = (*(PhotonMap().kernels if self.photons else ()), *((*CACHE_KERNELS, *TRACED_KERNELS) if self.cache else ()))
         return (trace_samples, *KERNELS, *more)
 
     @property
@@ -175,26 +180,28 @@ class LightField:
             with_hit_light=self.recursive > 0,
         )
         caustics = light_by_photons(job, self.photons, samples, hits) if self.photons else None
-        state = self.reconstruction(samples, job.device, job.seed, hits)
+        state = self.reconstruction(samples, job.device, job.seed, hits, job.scene)
         if not isinstance(state, LensReconstruction):
             state.caustics = caustics
         return state
 
     def reconstruction(
-        self, samples: SampleBuffer, device: Device, seed: int, hits: PrimaryHits | None = None
+        self,
+        samples: SampleBuffer,
+        device: Device,
+        seed: int,
+        hits: PrimaryHits | None = None,
+        scene: DeviceScene | None = None,
     ) -> AnyReconstruction:
         """Splats made of a sample buffer, ready for `gather`."""
         if self.primary_rays:
             return LensReconstruction(samples, device, self.preprocessing, seed)
-        splats = Reconstruction(
-            samples,
-            device,
-            self.preprocessing,
-            seed,
-            hits,
-            recursions=self.recursive,
-            recursive_rays=self.recursive_rays,
-        )
+        arguments = (samples, device, self.preprocessing, seed, hits)
+        recursion = {"recursions": self.recursive, "recursive_rays": self.recursive_rays}
+        if self.cache and self.scene_rays and scene is not None:
+            splats: Reconstruction = TracedReconstruction(scene, *arguments, **recursion)
+        else:
+            splats = Reconstruction(*arguments, **recursion)
         return CachedReconstruction(splats, hits, self.caching, self.rays) if self.cache else splats
 
     def estimate(self, job: Job, state: AnyReconstruction, film: Film, first: int, count: int) -> None:
