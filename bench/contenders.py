@@ -43,7 +43,10 @@ LADDERS: dict[str, tuple[Settings, ...]] = {
 }
 
 #: Methods without an indirect layer, and why.
-NO_LIGHT = {"ambient-occlusion": "its picture is occlusion, not light"}
+NO_LIGHT = {
+    "ambient-occlusion": "its picture is occlusion, not light",
+    "temporal-light-field": "it reconstructs the whole picture, not its indirect light",
+}
 
 #: Name -> maker of a contender that needs more than the library; an ImportError or ValueError says what is missing.
 PEERS: dict[str, Callable[[], Contender]] = {

@@ -62,7 +62,7 @@ def chosen(methods: tuple[str, ...], spp: int, rays: int) -> dict[str, Method]:
         if name not in RECONSTRUCTIONS:
             raise ValueError(f"methods holds {name!r}, expected names out of {', '.join(RECONSTRUCTIONS)}")
         kind = RECONSTRUCTIONS[name]
-        result[f"{name}, {spp} spp"] = kind(spp=spp, rays=rays) if hasattr(kind, "rays") else kind(spp=spp)
+        result[f"{name}, {spp} spp"] = kind(spp=spp, rays=rays) if getattr(kind, "rays", 0) else kind(spp=spp)
     return result
 
 

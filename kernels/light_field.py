@@ -131,6 +131,7 @@ class Gathered:
 
     radiance: wp.array[wp.vec3]
     near: wp.array[float]  # rays that met a surface within reach
+    inverse_distance: wp.array[float]  # one over the length of each ray, 0 to the sky; empty where nobody asked
     counts: wp.array[wp.vec4i]  # rays without support, to the sky, cut short; undersampled surfaces passed through
 
 
@@ -211,6 +212,7 @@ def reconstruct(
         place = receivers.places[j]
     total = gathered.radiance[i]
     near = gathered.near[i]
+    inverse = float(0.0)
     counts = gathered.counts[i]
     for ray in range(first_ray, first_ray + ray_count):
         # one sequence a pixel, cut into the shares of its samples
@@ -220,8 +222,12 @@ def reconstruct(
         total = total + found.radiance
         near = near + found.near
         counts = counts + found.counts
+        if found.distance > 0.0 and found.distance < FAR:
+            inverse = inverse + 1.0 / found.distance
     gathered.radiance[i] = total
     gathered.near[i] = near
+    if gathered.inverse_distance.shape[0] > 0:
+        gathered.inverse_distance[i] = gathered.inverse_distance[i] + inverse
     gathered.counts[i] = counts
 
 

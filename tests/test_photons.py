@@ -279,8 +279,8 @@ def test_search_equals_brute_force(limit, guess):
     found, near = (device.zeros(count, vec8) for _ in range(2))
     place = device.zeros(count, int)
     covers, reach2 = source.tree(shot, np.arange(shot.count, dtype=np.int32)), rng.uniform(0.0, 0.2, shot.count)
-    covers._set_radii(device.array(reach2[covers.order.numpy()], float), 1)
-    covers.refit(balls=True)
+    covers.set_radius2(device.array(reach2[covers.order.numpy()], float))
+    covers.refit_as_balls()
     points = [device.array(x, wp.vec3), device.array(n, wp.vec3)]
     device.launch(
         search, count, [tree.struct, covers.struct, *points, k, guess, limit2, stretch, facing], [found, near, place]

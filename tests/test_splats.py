@@ -117,7 +117,7 @@ def surfaces(count, seed=0):
 
 def walk(splats):
     """Blocks below the root, each with the path of (node, child) that leads there."""
-    first, found, stack = splats.tree._first, [], [(0, ())]
+    first, found, stack = splats.tree.struct.first.numpy(), [], [(0, ())]
     while stack:
         node, path = stack.pop()
         low, high = boxes(splats)[0][node], boxes(splats)[1][node]

@@ -3,6 +3,8 @@
 __version__ = "0.1.0"
 
 from warpgi import scenes  # type: ignore[attr-defined]
+from warpgi.animate import render_animation
+from warpgi.animation import Animation
 from warpgi.camera import Camera
 from warpgi.denoise import denoise
 from warpgi.device import Device
@@ -23,7 +25,7 @@ from warpgi.methods import (
     Sampler,
     TemporalLightField,
 )
-from warpgi.metrics import compare
+from warpgi.metrics import compare, flicker
 from warpgi.mitsuba_samples import sample_from_mitsuba
 from warpgi.mitsuba_scene import to_mitsuba
 from warpgi.progress import Progress
@@ -33,11 +35,13 @@ from warpgi.result import Render
 from warpgi.samples import SampleBuffer
 from warpgi.sampling import sample
 from warpgi.scene import Scene, Shape
+from warpgi.sequence import Sequence
 
 __all__ = [
     "METHODS",
     "ATrous",
     "AmbientOcclusion",
+    "Animation",
     "Camera",
     "Coated",
     "Conductor",
@@ -62,15 +66,18 @@ __all__ = [
     "SampleBuffer",
     "Sampler",
     "Scene",
+    "Sequence",
     "Shape",
     "SpotLight",
     "TemporalLightField",
     "Texture",
     "compare",
     "denoise",
+    "flicker",
     "load_scene",
     "reconstruct",
     "render",
+    "render_animation",
     "sample",
     "sample_from_mitsuba",
     "scenes",

@@ -92,6 +92,56 @@ class RenderCommand:
 
 
 @dataclass(frozen=True)
+class AnimateCommand:
+    """Render a sequence, a file a frame; a run that was stopped goes on with --resume."""
+
+    sequence: tyro.conf.Positional[str]
+    """A built-in sequence, with parameters as in moving-light:frames=20."""
+    method: METHOD_SETTINGS = field(default_factory=gi.PathTracing)  # type: ignore[valid-type]
+    """How to render it; path tracing by default."""
+    size: tuple[int, int] = (256, 256)
+    """Width and height in pixels."""
+    seed: int = 0
+    """Which random numbers."""
+    frames: tuple[int, int] | None = None
+    """First frame, and the one after the last; all by default."""
+    out: str = "frames/frame-{:04d}.exr"
+    """The frames' files; the folder is made."""
+    resume: bool = False
+    """Keep files that are whole and of these very frames, and render the others."""
+    vary_seed: bool = True
+    """Each frame has random numbers of its own; without, a still sequence has equal frames."""
+    device: str | None = None
+    """cpu, cuda:0, ...; a GPU if there is one."""
+    threads: int | None = None
+    """CPU threads; all by default."""
+    memory_limit: float = 3.0
+    """GiB that a frame's arrays may take on the device."""
+
+    def run(self) -> None:
+        device = _device(self.device, self.threads, self.memory_limit)
+        sequence = open_sequence(self.sequence)
+        frames = None if self.frames is None else _frame_range(*self.frames)
+        animation = gi.render_animation(
+            sequence,
+            self.method,
+            self.size,
+            self.seed,
+            device,
+            sys.stderr.isatty(),
+            self.out,
+            self.resume,
+            frames,
+            self.vary_seed,
+        )
+        stages = ", ".join(f"{stage} {seconds:.2f} s" for stage, seconds in animation.timings.items())
+        found = len(animation) - len(animation.rendered)
+        print(f"{sequence.name}, {len(animation.rendered)} frames rendered, {found} found: {stages}")
+        _warn_of(animation.counts)
+        print(f"wrote {animation.paths[0]} to {animation.paths[-1].name}")
+
+
+@dataclass(frozen=True)
 class ReconstructCommand:
     """Reconstruct a picture from a sample buffer; no scene is needed."""
 
@@ -170,10 +220,12 @@ class CompareCommand:
 
 @dataclass(frozen=True)
 class ScenesCommand:
-    """List the built-in scenes."""
+    """List the built-in scenes and sequences."""
 
     def run(self) -> None:
         _table(gi.scenes.SCENES)
+        print("sequences:")
+        _table(gi.scenes.SEQUENCES)
 
 
 @dataclass(frozen=True)
@@ -202,6 +254,7 @@ class InfoCommand:
 
 COMMANDS = (
     Annotated[RenderCommand, tyro.conf.subcommand("render")]
+    | Annotated[AnimateCommand, tyro.conf.subcommand("animate")]
     | Annotated[ReconstructCommand, tyro.conf.subcommand("reconstruct")]
     | Annotated[DenoiseCommand, tyro.conf.subcommand("denoise")]
     | Annotated[CompareCommand, tyro.conf.subcommand("compare")]
@@ -241,6 +294,10 @@ def _prepare(out: tuple[Path, ...], device: str | None, threads: int | None, mem
         check_output(path)
     if not out:
         _warn("no --out FILE.exr or --out FILE.png: the picture will not be kept")
+    return _device(device, threads, memory_limit)
+
+
+def _device(device: str | None, threads: int | None, memory_limit: float) -> gi.Device:
     if not 0.0 < memory_limit < math.inf:
         raise ValueError(f"memory-limit is {memory_limit:g} GiB, expected a number above 0")
     return gi.Device(device, threads, int(memory_limit * 2**30))
@@ -270,28 +327,49 @@ def _keep(picture: gi.Render, out: tuple[Path, ...], exposure: float) -> None:
     kinds = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in rays.items())
     if rays:
         print(f"{kinds}: {sum(rays.values()) / max(seconds, 1e-9) / 1e6:.2f} M rays/s")
-    for kind, meaning in WRONG.items():
-        if picture.counts.get(kind):
-            _warn(f"{picture.counts[kind]} {meaning}")
+    _warn_of(picture.counts)
     for path in out:
         print(f"wrote {path}")
+
+
+def _warn_of(counts: Mapping[str, int]) -> None:
+    for kind, meaning in WRONG.items():
+        if counts.get(kind):
+            _warn(f"{counts[kind]} {meaning}")
 
 
 def open_scene(text: str) -> gi.Scene:
     """A file where there is one or the name looks like one, else a built-in scene with its parameters."""
     if Path(text).suffix.lower() in SUFFIXES or Path(text).exists():
         return gi.load_scene(text)
+    name, parameters = _parse("scene", text, "courtyard:detail=0.2")
+    return gi.scenes.build(name, **parameters)
+
+
+def open_sequence(text: str) -> gi.Sequence:
+    """A built-in sequence with its parameters."""
+    name, parameters = _parse("sequence", text, "moving-light:frames=20")
+    return gi.scenes.build_sequence(name, **parameters)
+
+
+def _parse(kind: str, text: str, example: str) -> tuple[str, dict[str, Any]]:
     name, _, rest = text.partition(":")
     parameters: dict[str, Any] = {}
     for item in filter(None, rest.split(",")):
         key, equals, value = item.partition("=")
         if not equals:
-            raise ValueError(f"scene is {text!r}, expected parameters as in courtyard:detail=0.2")
+            raise ValueError(f"{kind} is {text!r}, expected parameters as in {example}")
         try:
             parameters[key] = ast.literal_eval(value)
         except (ValueError, SyntaxError):
             parameters[key] = value
-    return gi.scenes.build(name, **parameters)
+    return name, parameters
+
+
+def _frame_range(first: int, after: int) -> range:
+    if after <= first:
+        raise ValueError(f"frames is {first} {after}, expected the first and, larger, the one after the last")
+    return range(first, after)
 
 
 def _layer(path: Path, name: str) -> np.ndarray:

@@ -41,7 +41,7 @@ class Checkpoint:
         self.identity = {
             "format": FORMAT,
             "version": warpgi.__version__,
-            "scene": job.scene.fingerprint(),
+            "scene": job.scene.scene.fingerprint,
             "method": type(method).__name__,
             "size": list(job.size),
             "seed": job.seed,

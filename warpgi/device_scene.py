@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
+from functools import cached_property
 
 import numpy as np
 import warp as wp
@@ -30,8 +30,17 @@ KINDS = {
 LEAST_SHARE = 1e-3
 
 
+# Fields of the struct that depend on triangles alone.
+GEOMETRY = ("points", "indices", "face_normals", "face_shapes", "normals", "uvs", "moving", "motion", "tree")
+
+
 class DeviceScene:
     """What kernels see of a scene, positions taken relative to its centre so that float32 serves far-away scenes.
+
+    Args:
+        scene: the scene.
+        device: where its arrays live.
+        before: another scene on that device, whose triangles and their tree are shared where they are the same.
 
     Attributes:
         struct: the `kernels.scene.Scene` argument of kernels.
@@ -40,7 +49,7 @@ class DeviceScene:
         nbytes: bytes of all arrays on the device.
     """
 
-    def __init__(self, scene: Scene, device: Device) -> None:
+    def __init__(self, scene: Scene, device: Device, before: DeviceScene | None = None) -> None:
         self.scene = scene
         self.device = device
         low, high = scene.bounds()
@@ -48,8 +57,13 @@ class DeviceScene:
         self.radius = 0.5 * float(np.linalg.norm(high - low))
         self.nbytes = 0
         self._arrays: list[wp.array] = []
+        self._geometry_arrays: list[wp.array] = []
+        self.first_face = np.cumsum([0] + [len(shape.faces) for shape in scene.shapes])
         self.struct = kernels.Scene()
-        self._add_geometry()
+        if before is not None and before.geometry == self.geometry:
+            self._share_geometry(before)
+        else:
+            self._add_geometry()
         self._add_textures()
         self._add_lights_and_shapes()
 
@@ -69,13 +83,17 @@ class DeviceScene:
         result.width, result.height = size
         return result
 
-    def fingerprint(self) -> str:
-        """SHA-256 of everything that a picture depends on."""
-        digest = hashlib.sha256(repr((self.scene.camera, self.centre.tolist())).encode())
-        digest.update(repr(self.struct.environment).encode())
-        for array in self._arrays:
-            digest.update(array.numpy().tobytes())
-        return digest.hexdigest()
+    @cached_property
+    def geometry(self) -> tuple[str, ...]:
+        """Fingerprints of the shapes' triangles."""
+        return tuple(shape.geometry_fingerprint for shape in self.scene.shapes)
+
+    def _share_geometry(self, before: DeviceScene) -> None:
+        for name in GEOMETRY:
+            setattr(self.struct, name, getattr(before.struct, name))
+        self._arrays += before._geometry_arrays
+        self._geometry_arrays = before._geometry_arrays
+        self.nbytes += sum(array.capacity for array in self._arrays)
 
     def _upload(self, values: np.ndarray, dtype: object) -> wp.array:
         array = self.device.array(values, dtype)
@@ -91,7 +109,6 @@ class DeviceScene:
             np.int32
         )
         shape_of_face = np.repeat(np.arange(len(shapes), dtype=np.int32), [len(shape.faces) for shape in shapes])
-        self.first_face = np.cumsum([0] + [len(shape.faces) for shape in shapes])
         a, b, c = (points[faces[:, i]] for i in range(3))
         normals = np.cross(b - a, c - a)
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -103,7 +120,7 @@ class DeviceScene:
         struct.face_shapes = self._upload(shape_of_face, int)
         struct.normals = self._upload(_per_vertex([s.normals for s in shapes], starts, 3), wp.vec3)
         struct.uvs = self._upload(_per_vertex([s.uv for s in shapes], starts, 2), wp.vec2)
-        struct.moving = int(self.scene.moves)
+        struct.moving, struct.time = int(self.scene.moves), 0.0
         motion = None
         if struct.moving:
             still = [shape.motion is None for shape in shapes]
@@ -115,6 +132,7 @@ class DeviceScene:
         for name, values in build_triangle_tree(points.astype(np.float32), faces, motion).items():
             setattr(tree, name, self._upload(values, float if values.dtype == np.float32 else int))
         struct.tree = tree
+        self._geometry_arrays = list(self._arrays)
 
     def _add_textures(self) -> None:
         self._textures: dict[int, int] = {}

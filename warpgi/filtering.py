@@ -16,7 +16,7 @@ from warpgi.device import Device
 from warpgi.film import Film
 from warpgi.job import Job
 from warpgi.methods.path import NEVER, Sampler, check_paths
-from warpgi.reconstruction import pixel_means
+from warpgi.reconstruction import PrimaryHits, pixel_means
 from warpgi.samples import NO_HIT, SampleBuffer
 from warpgi.sampling import PRIMARY_BYTES, SECONDARY_BYTES, trace_sample_buffer
 
@@ -130,16 +130,57 @@ def pixel_rows(samples: SampleBuffer) -> FilterInput:
     """A row for each pixel: means over its samples, with the harmonic mean distance of secondary hits."""
     _check_secondary(samples)
     primary, usable = _usable(samples)
+    return _mean_rows(
+        samples,
+        PrimaryHits(samples.origin, samples.unit_origin_normal, samples.albedo, samples.spp),
+        primary,
+        usable,
+        samples.radiance,
+        hit_distance(samples).reshape(-1),
+    )
+
+
+def gathered_rows(
+    samples: SampleBuffer, hits: PrimaryHits | None, incident: np.ndarray, inverse_distance: np.ndarray
+) -> FilterInput:
+    """A row for each pixel: means over its primary hits of the light that was gathered there.
+
+    Args:
+        samples: what the light was gathered from.
+        hits: where; None: at the samples' own primary hits.
+        incident: irradiance over pi, shape (M, 3).
+        inverse_distance: mean of one over the distance to what was met, shape (M,).
+    """
+    if hits is None:
+        hits = PrimaryHits(samples.origin, samples.unit_origin_normal, samples.albedo, samples.spp)
+        primary = samples.checked.is_primary
+    else:
+        primary = np.abs(hits.origin).max(axis=1) < NO_HIT
+    inverse = np.stack([inverse_distance, primary, primary], axis=1).astype(np.float32)
+    sums = _hit_means(samples, hits, inverse)
+    distance = _divide(sums[:, 1], sums[:, 0], sums[:, 0] > 0)
+    return _mean_rows(samples, hits, primary, primary, incident, distance)
+
+
+def _mean_rows(
+    samples: SampleBuffer,
+    hits: PrimaryHits,
+    primary: np.ndarray,
+    usable: np.ndarray,
+    incident: np.ndarray,
+    distance: np.ndarray,
+) -> FilterInput:
+    """A row for each pixel, of the incident light at its usable hits and the features of its primary ones."""
 
     def mean(flags: np.ndarray, values: np.ndarray) -> np.ndarray:
-        return pixel_means(samples, np.where(flags[:, None], values, np.float32(0.0))).reshape(-1, 3)
+        return _hit_means(samples, hits, np.where(flags[:, None], values, np.float32(0.0)))
 
-    ones = np.ones((len(samples), 3), np.float32)
+    ones = np.ones((len(primary), 3), np.float32)
     seen, sent = mean(primary, ones), mean(usable, ones)
-    carried = mean(usable, samples.albedo)
+    carried = mean(usable, hits.albedo)
     known = carried > SMALLEST_ALBEDO * sent
-    light = mean(usable, samples.albedo * np.where(usable[:, None], samples.radiance, np.float32(0.0)))
-    albedo = mean(primary, samples.albedo)
+    light = mean(usable, hits.albedo * np.where(usable[:, None], incident, np.float32(0.0)))
+    albedo = mean(primary, hits.albedo)
     return FilterInput(
         width=samples.width,
         height=samples.height,
@@ -149,12 +190,19 @@ def pixel_rows(samples: SampleBuffer) -> FilterInput:
         # what so dark a surface reflects stays as it came
         albedo=np.where(known | (sent == 0), albedo, np.float32(0.0)),
         rest=np.where(known, np.float32(0.0), light),
-        normal=mean(primary, samples.unit_origin_normal),
-        position=_divide(mean(primary, samples.origin), seen, seen > 0),
-        hit_distance=hit_distance(samples).reshape(-1),
+        normal=mean(primary, hits.normal),
+        position=_divide(mean(primary, hits.origin), seen, seen > 0),
+        hit_distance=distance,
         samples=samples,
         counts=_faults(samples),
     )
+
+
+def _hit_means(samples: SampleBuffer, hits: PrimaryHits, values: np.ndarray) -> np.ndarray:
+    """Mean of each pixel's hits, (M, 3) -> (H W, 3) float32."""
+    if hits.per_pixel == samples.spp:
+        return pixel_means(samples, values).reshape(-1, 3)
+    return values.reshape(-1, hits.per_pixel, 3).mean(axis=1, dtype=np.float64).astype(np.float32)
 
 
 def layer_rows(
@@ -263,9 +311,18 @@ class SampleFilter:
         """How many units of work there are, and what they are called."""
         raise NotImplementedError
 
+    @property
+    def hits(self) -> int:
+        """Primary hits per pixel that are traced."""
+        return self.spp
+
     def reconstruction(self, samples: SampleBuffer, device: Device, seed: int) -> Filtering:
         """The filter on a sample buffer, ready for `gather`."""
         raise NotImplementedError
+
+    def filtering(self, samples: SampleBuffer, hits: PrimaryHits, device: Device, seed: int) -> Filtering:
+        """The filter on what was traced: a sample buffer, and `hits` primary hits per pixel."""
+        return self.reconstruction(samples, device, seed)
 
     def device_bytes(self, size: tuple[int, int]) -> int:
         """Device memory it takes beside scene and film."""
@@ -273,18 +330,18 @@ class SampleFilter:
 
     def prepare(self, job: Job, film: Film) -> Filtering:
         """Traces the input, with what is not filtered going to the film."""
-        samples, _ = trace_sample_buffer(
+        samples, hits = trace_sample_buffer(
             job,
             film,
             self.spp,
-            self.spp,
-            max(1, self.light_samples // self.spp),
+            self.hits,
+            max(1, self.light_samples // self.hits),
             self.max_depth or NEVER,
             self.roulette_depth or NEVER,
             self.sampler,
             with_hit_light=False,
         )
-        return self.reconstruction(samples, job.device, job.seed)
+        return self.filtering(samples, hits, job.device, job.seed)
 
     def estimate(self, job: Job, state: Filtering, film: Film, first: int, count: int) -> None:
         """Does `count` units of the filter's work."""

@@ -170,8 +170,7 @@ class _MovingSplatTree(SplatTree):
             start, size = self.levels[0]
             inputs = [self.struct.blocks, motion.ways, time, self.block_count, start, self.noise]
             device.launch(moving_kernels.fit_moving_leaves, size, inputs, [nodes])
-            for (start, size), (below, count_below) in zip(self.levels[1:], self.levels, strict=False):
-                device.launch(bvh.fit_level, size, [start, below, count_below], [nodes])
+            self.fit_levels(nodes)
 
     def shrink(self, rays: still_kernels.Rays, margin: float, escaped: np.ndarray, extent: float) -> None:
         """Shrinks what input rays cross at their times (Lehtinen et al. 2012, section 2.3.1)."""

@@ -62,6 +62,34 @@ def compare(image: Any, reference: Any) -> dict[str, float | None]:
     }
 
 
+def flicker(images: Any, references: Any) -> float:
+    """RMS over pixels, channels and pairs of neighbouring frames of the change of (x - ref) from frame to frame.
+
+    Motion that the references show too costs nothing, and neither does an error that stays.
+
+    Args:
+        images: linear radiance of each frame, shape (N, H, W, 3), N at least 2.
+        references: the same.
+
+    Raises:
+        TypeError, ValueError: they are no such arrays.
+
+    Example:
+        >>> import numpy as np
+        >>> references = np.zeros((3, 2, 2, 3))
+        >>> images = references + np.array([0.0, 0.1, 0.0])[:, None, None, None]
+        >>> round(flicker(images, references), 6), flicker(images + 0.5, images)
+        (0.1, 0.0)
+    """
+    x, ref = (
+        checks.finite_array(name, value, (None, None, None, 3))
+        for name, value in (("images", images), ("references", references))
+    )
+    if x.shape != ref.shape or len(x) < 2 or x.size == 0:
+        raise ValueError(f"images has shape {x.shape}, references {ref.shape}, expected one shape and 2 frames or more")
+    return math.sqrt(float(np.square(np.diff(x - ref, axis=0)).mean()))
+
+
 def count_fireflies(image: np.ndarray, variance: np.ndarray) -> int:
     """Pixels that owe their light to one or two of many samples: what a path tracer hardly finds is there, but seldom.
 

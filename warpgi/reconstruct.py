@@ -10,7 +10,7 @@ import numpy as np
 from warpgi import checks
 from warpgi.device import Device, as_device
 from warpgi.filtering import SampleFilter, hit_distance
-from warpgi.methods import RECONSTRUCTIONS, AmbientOcclusion, LightField
+from warpgi.methods import RECONSTRUCTIONS, AmbientOcclusion, LightField, TemporalLightField
 from warpgi.passes import Passes
 from warpgi.progress import Progress, progress_bar
 from warpgi.reconstruction import pixel_means
@@ -27,7 +27,7 @@ def reconstruct(
     device: str | Device | None = None,
     progress: bool | Callable[[Progress], None] = False,
 ) -> Render:
-    """Reconstructs or filters indirect light, ambient occlusion, or defocus and motion, from samples; no scene is needed.
+    """Reconstructs or filters indirect light, ambient occlusion, or defocus and motion; no scene is needed.
 
     Args:
         samples: the input, from `sample`, a file or any other renderer.
@@ -37,9 +37,9 @@ def reconstruct(
         progress: True shows a bar on standard error; a function gets a `Progress` after every pass.
 
     Returns:
-        Layers "indirect" (or "image" for what makes the whole picture), "albedo", "normal", "position", "hit_distance", and
-        "direct" where the samples hold it. `counts` says how many samples could not be used and how many rays found no
-        support.
+        Layers "indirect" (or "image" for what makes the whole picture), "albedo", "normal", "position",
+        "hit_distance", and "direct" where the samples hold it. `counts` says how many samples could not be used and how
+        many rays found no support.
 
     Raises:
         TypeError, ValueError: an argument is wrong; nothing has been computed then.

@@ -76,6 +76,7 @@ class Reconstruction:
         seed: which reconstruction rays.
         hits: where light is gathered; None: at the samples' own primary hits.
         reach: distance within which a surface counts as near, for ambient occlusion.
+        with_distance: keep what `inverse_distance` needs.
 
     Raises:
         ValueError: the samples hold no secondary rays, or do not fit into the device's memory limit.
@@ -91,6 +92,7 @@ class Reconstruction:
         reach: float = np.inf,
         recursions: int = 0,
         recursive_rays: int = 16,
+        with_distance: bool = False,
     ) -> None:
         if not samples.has_secondary_rays:
             raise ValueError("samples hold no secondary rays, expected a sample buffer of format 2.0 or newer")
@@ -125,6 +127,7 @@ class Reconstruction:
         )
         self._found = np.zeros(4, np.int64)  # beside what `_gathered` counts
         self._gathered = self._make_gathered(len(self.primary))
+        self._gathered.inverse_distance = device.zeros(len(self.primary) if with_distance else 0, float)
         self.rays_done = 0
 
     def gather(self, first: int, count: int, each: int) -> None:
@@ -154,6 +157,20 @@ class Reconstruction:
         result = self.device.zeros(len(hits), wp.vec3)
         self.device.launch(kernels.gathered_irradiance, len(hits), [gathered, rays], [result])
         self._found += gathered.counts.numpy().sum(axis=0, dtype=np.int64)
+        return result
+
+    def incident(self) -> np.ndarray:
+        """Light that falls on each primary hit, irradiance over pi, shape (M, 3); 0 for rows without one."""
+        result = np.zeros((self._receiver_albedo.size, 3), np.float32)
+        known = self.rays_done - self._gathered.counts.numpy()[:, 0]
+        result[self.primary] = self._gathered.radiance.numpy() / np.maximum(known, 1)[:, None]
+        return result
+
+    def inverse_distance(self) -> np.ndarray:
+        """Mean over each primary hit's rays of one over their length, shape (M,); the sky's counts as 0."""
+        result = np.zeros(self._receiver_albedo.size, np.float32)
+        known = self.rays_done - self._gathered.counts.numpy()[:, 0]
+        result[self.primary] = self._gathered.inverse_distance.numpy() / np.maximum(known, 1)
         return result
 
     def near(self) -> np.ndarray:

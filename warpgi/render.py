@@ -8,7 +8,7 @@ import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -39,6 +39,14 @@ class Interrupted(KeyboardInterrupt):
         super().__init__("render interrupted")
         self.render = render
         self.passes = passes
+
+
+class Ends(NamedTuple):
+    """What ends a render before its time, as `render` takes it."""
+
+    seconds: float | None = None
+    error: float | None = None
+    checkpoint: str | Path | None = None
 
 
 def render(
@@ -83,7 +91,7 @@ def render(
         (8, 8, 3)
     """
     method = PathTracing() if method is None else method
-    _check(scene, method)
+    check_method(scene, method)
     size = checks.image_size(size)
     seed = checks.count("seed", seed, 0)
     _check_end(method, seconds, error, checkpoint)
@@ -91,11 +99,37 @@ def render(
     if method.needs_light and not scene.has_light():
         warnings.warn("the scene has no light: the picture is black", stacklevel=2)
 
+    ends = Ends(seconds, error, checkpoint)
+    return render_scene(scene, method, size, seed, where, progress, ends)[0]
+
+
+def render_scene(
+    scene: Scene,
+    method: Method,
+    size: tuple[int, int],
+    seed: int,
+    where: Device,
+    progress: bool | Callable[[Progress], None] = False,
+    ends: Ends | None = None,
+    before: DeviceScene | None = None,
+    prepare: Callable[[Job, Film], Any] | None = None,
+) -> tuple[Render, DeviceScene, Any]:
+    """`render` with its arguments checked, and what one frame of a sequence can leave to the next.
+
+    Args:
+        scene, method, size, seed, where, progress, ends: as in `render`.
+        before: arrays of the frame before on this device, to share.
+        prepare: what makes the method's state; its own `prepare` by default.
+
+    Returns:
+        The picture, the scene's arrays on the device, and the method's state.
+    """
+    seconds, error, checkpoint = ends or Ends()
     timings = Timings()
     with timings.stage("compile"):
         where.load(method.kernels)
     with timings.stage("upload"):
-        on_device = DeviceScene(scene, where)
+        on_device = DeviceScene(scene, where, before)
         film = Film(size, where, where.memory_limit - on_device.nbytes - method.device_bytes(size))
         job = Job(on_device, on_device.camera(size), size, seed, where)
     passes = Passes(*method.passes())
@@ -125,7 +159,7 @@ def render(
     state: Any = None
     try:
         with timings.stage("prepare"):
-            state = method.prepare(job, film)
+            state = (prepare or method.prepare)(job, film)
             where.synchronize()
         with timings.stage("estimate"), progress_bar(progress) as report:
             passes.run(
@@ -161,7 +195,7 @@ def render(
     result.timings["image"] = timings["image"]
     if interrupted:
         raise Interrupted(result, passes)
-    return result
+    return result, on_device, state
 
 
 def provenance(method: Method, seed: int, device: Device) -> dict[str, Any]:
@@ -197,7 +231,12 @@ def _check_end(method: Method, seconds: float | None, error: float | None, check
             raise ValueError(f"{name} is given, expected None: {type(method).__name__} keeps more than its film")
 
 
-def _check(scene: Scene, method: Method) -> None:
+def check_method(scene: Scene, method: Method) -> None:
+    """Refuses what is no scene or no method, and a scene that the method cannot render.
+
+    Raises:
+        TypeError, ValueError: it is such.
+    """
     if not isinstance(scene, Scene):
         raise TypeError(f"scene is {type(scene).__name__}, expected Scene")
     if not isinstance(method, tuple(METHODS.values())):

@@ -126,6 +126,8 @@ class Render:
     """What computed it."""
     versions: dict[str, str] = field(default_factory=dict)
     """Versions of warpgi, Warp and the like."""
+    identity: str = ""
+    """Digest of all that a frame of an animation depends on."""
 
     def __post_init__(self) -> None:
         if not self.layers:
@@ -207,6 +209,8 @@ class Render:
 
     def _attributes(self) -> dict[str, str]:
         values = {name: str(getattr(self, name)) for name in ("method", "scene", "device", "seed", "spp")}
+        if self.identity:
+            values["identity"] = self.identity
         values |= {name: json.dumps(getattr(self, name)) for name in ("settings", "timings", "counts", "versions")}
         values["seconds"] = f"{sum(self.timings.values()):.6g}"  # for people; `load` reads the timings
         return {PREFIX + name: text for name, text in values.items()}
@@ -236,7 +240,7 @@ class Render:
                 f"{name} holds {', '.join(channels) or 'no float channel'}, expected R, G, B or a known layer"
             )
         own = {key[len(PREFIX) :]: text for key, text in attributes.items() if key.startswith(PREFIX)}
-        fields: dict[str, Any] = {key: own.get(key, "") for key in ("method", "scene", "device")}
+        fields: dict[str, Any] = {key: own.get(key, "") for key in ("method", "scene", "device", "identity")}
         for key, kind in [
             ("seed", int),
             ("spp", int),

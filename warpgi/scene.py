@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from warpgi import checks
 from warpgi.camera import Camera
+from warpgi.fingerprint import fingerprint
 from warpgi.lights import DistantLight, Environment, Light, PointLight, SpotLight
 from warpgi.materials import Coated, Conductor, Dielectric, Diffuse, Emissive, Material, Mirror
 
@@ -104,6 +106,16 @@ class Shape:
         value = getattr(self.material, "albedo", getattr(self.material, "reflectance", None))
         return value if isinstance(value, Texture) else None
 
+    @cached_property
+    def geometry_fingerprint(self) -> str:
+        """SHA-256 of its triangles and what is interpolated over them: all but name, material and emission."""
+        return fingerprint(self.vertices, self.faces, self.normals, self.uv, self.motion)
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """SHA-256 of all that it is."""
+        return fingerprint(self.name, self.geometry_fingerprint, self.material, self.emission)
+
     def areas(self) -> np.ndarray:
         """Area of every triangle, shape (F,), float64."""
         a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
@@ -142,6 +154,11 @@ class Scene:
             raise ValueError("lights holds more than one Environment, expected at most one")
         if not isinstance(self.camera, Camera):
             raise TypeError(f"camera is {type(self.camera).__name__}, expected Camera")
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """SHA-256 of all that a picture of it depends on."""
+        return fingerprint(self.name, self.camera, self.lights, self.shapes)
 
     @property
     def triangle_count(self) -> int:

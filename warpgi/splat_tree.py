@@ -59,13 +59,22 @@ class SplatTree:
         arrays = (self.struct.nodes, self.struct.first, self.struct.blocks, self.order)
         return sum(array.capacity for array in arrays)
 
-    def refit(self, balls: bool = False) -> None:
-        """Boxes from the splats' present sizes, as discs or as balls, level by level."""
+    def refit(self) -> None:
+        """Boxes from the splats' present sizes, as discs."""
+        self._refit(flat=1.0)
+
+    def refit_as_balls(self) -> None:
+        """The same as balls."""
+        self._refit(flat=0.0)
+
+    def _refit(self, flat: float) -> None:
         start, size = self.levels[0]
         blocks, nodes = self.struct.blocks, self.struct.nodes
-        self.device.launch(
-            bvh.fit_leaves, size, [blocks, self.block_count, start, self.noise, float(not balls)], [nodes]
-        )
+        self.device.launch(bvh.fit_leaves, size, [blocks, self.block_count, start, self.noise, flat], [nodes])
+        self.fit_levels(nodes)
+
+    def fit_levels(self, nodes: wp.array) -> None:
+        """Boxes of all levels above the lowest, level by level."""
         for (start, size), (below, count_below) in zip(self.levels[1:], self.levels, strict=False):
             self.device.launch(bvh.fit_level, size, [start, below, count_below], [nodes])
 

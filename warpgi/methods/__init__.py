@@ -52,6 +52,20 @@ class Method(Protocol):
         """What it counts beside the film."""
 
 
+class FrameMethod(Method, Protocol):
+    """What `render_animation` asks, beside that, of a method whose frames build on each other.
+
+    It is asked for the state of every frame in order, also of frames whose pictures are there already or not needed;
+    the picture of a frame then depends on all frames up to it.
+    """
+
+    def prepare_next(self, job: Job, film: Film, before: Any) -> Any:
+        """Builds the state of a frame, as `prepare` does, from that of the frame before, None for frame 0.
+
+        `before` may be changed or used up; `estimate` changes nothing that is read here.
+        """
+
+
 #: Name of a method, the stem of its files, -> its settings.
 METHODS: dict[str, type] = {
     "path": PathTracing,
@@ -75,6 +89,7 @@ __all__ = [
     "RECONSTRUCTIONS",
     "ATrous",
     "AmbientOcclusion",
+    "FrameMethod",
     "IrradianceCache",
     "IrradianceFilter",
     "Kernel",

@@ -238,7 +238,7 @@ class Mapping:
             maps.irradiance = self._tree(points, np.arange(points.count, dtype=np.int32))
             inputs = [self.job.scene.struct, every, maps.diffuse_look, maps.reach2, number]
             self.job.device.launch(kernels.estimate_at, maps.irradiance.block_count, inputs, [maps.irradiance])
-            self._trees[-1].refit(balls=True)
+            self._trees[-1].refit_as_balls()
             maps.diffuse = self._tree(shot, empty)
         else:
             maps.diffuse = self._tree(shot, shot.of_kind(int(photon_kernels.INDIRECT)))

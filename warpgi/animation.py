@@ -1,0 +1,80 @@
+"""A rendered sequence: pictures in memory or in files, one a frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from collections.abc import Sequence as Series
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from warpgi.result import Render
+
+
+@dataclass(eq=False)
+class Animation:
+    """The frames of a rendered sequence; those in files are read when they are asked for, one at a time.
+
+    Raises:
+        ValueError: there is not one source a frame.
+
+    Example:
+        >>> import warpgi as gi
+        >>> animation = gi.render_animation(gi.scenes.moving_light(frames=2), gi.PathTracing(spp=1), size=(8, 8))
+        >>> len(animation), animation[1].image.shape
+        (2, (8, 8, 3))
+    """
+
+    sources: Series[Render | Path]
+    """Each frame's picture, or its file."""
+    frames: Series[int]
+    """Each frame's number in the sequence."""
+    fps: float = 24.0
+    """Frames per second."""
+    timings: dict[str, float] = field(default_factory=dict)
+    """Seconds by stage, of the frames that were rendered and not found."""
+    counts: dict[str, int] = field(default_factory=dict)
+    """Sums of the frames' counts."""
+    rendered: tuple[int, ...] = ()
+    """Numbers of the frames that were rendered and not found."""
+
+    def __post_init__(self) -> None:
+        if len(self.sources) != len(self.frames) or not self.sources:
+            raise ValueError(f"sources holds {len(self.sources)} of {len(self.frames)} frames, expected each of them")
+
+    def __len__(self) -> int:
+        return len(self.sources)
+
+    def __getitem__(self, index: int) -> Render:
+        source = self.sources[index]
+        return source if isinstance(source, Render) else Render.load(source)
+
+    def __iter__(self) -> Iterator[Render]:
+        return (self[index] for index in range(len(self)))
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """Files of the frames, where there are any."""
+        return tuple(source for source in self.sources if isinstance(source, Path))
+
+    def stack(self, layer: str = "image") -> np.ndarray:
+        """One layer of all frames, shape (N, H, W, C), float32: all of it in memory.
+
+        Raises:
+            ValueError: a frame has no such layer.
+        """
+        return np.stack([frame_layer(frame, layer) for frame in self])
+
+
+def frame_layer(frame: Render, name: str) -> np.ndarray:
+    """One layer of a picture, shape (H, W, C); "image" is always there.
+
+    Raises:
+        ValueError: there is none.
+    """
+    if name == "image":
+        return frame.image
+    if name not in frame.layers:
+        raise ValueError(f"layer is {name!r}, expected one of image, {', '.join(frame.layers)}")
+    return frame.layers[name]
