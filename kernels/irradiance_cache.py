@@ -208,9 +208,7 @@ def find_uncovered(
 
 
 @wp.kernel
-def clamp_radii(
-    offset: int, positions: wp.array[wp.vec3], radii: wp.array[float], count: int, result: wp.array[float]
-):
+def clamp_radii(offset: int, positions: wp.array[wp.vec3], radii: wp.array[float], count: int, result: wp.array[float]):
     """One thread owns one record: its radius by its neighbours', R_i <= R_j + |x_i - x_j| (Krivanek et al. 2006)."""
     i = offset + wp.tid()
     radius = radii[i]

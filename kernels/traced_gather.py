@@ -44,7 +44,8 @@ COVERING = (
                 const float nx = p[24 + k], ny = p[32 + k], nz = p[40 + k], r2 = p[48 + k];
                 const float d2 = dx * dx + dy * dy + dz * dz;
                 const float plane = dx * nx + dy * ny + dz * nz;
-                const bool same = (nx * n[0] + ny * n[1] + nz * n[2] > 0.7f) & (plane * plane <= 0.1f * r2 + noise * noise);
+                const bool same =
+                    (nx * n[0] + ny * n[1] + nz * n[2] > 0.7f) & (plane * plane <= 0.1f * r2 + noise * noise);
                 const float tent = 1.0f - wp::sqrt(d2 / larger(r2, 1.0e-30f));
                 w[k] = (same & (d2 < r2)) ? tent : 0.0f;
             }

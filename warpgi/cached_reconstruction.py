@@ -6,8 +6,8 @@ import numpy as np
 import warp as wp
 
 from warpgi.irradiance import SplatSource
-from warpgi.record_cache import Caching, RecordCache
 from warpgi.reconstruction import PrimaryHits, Reconstruction
+from warpgi.record_cache import Caching, RecordCache
 from warpgi.samples import SampleBuffer
 
 

@@ -84,7 +84,7 @@ class PathSource:
             self.device.launch(path_strata.trace_strata, count, inputs, [strata])
 
         self.counts["record_rays"] += len(points) * rings * sectors
-        return _irradiance(self.device, points, normals, keys, rings, sectors, fill)
+        return sum_hemispheres(self.device, points, normals, keys, rings, sectors, fill)
 
     def at_hits(self, hits: np.ndarray, rays: int) -> wp.array:
         """See `IrradianceSource`."""
@@ -117,7 +117,7 @@ class SplatSource:
 
         self.counts["record_rays"] += len(points) * rings * sectors
         points = points - self.reconstruction.centre
-        return _irradiance(self.device, points, normals, keys, rings, sectors, fill)
+        return sum_hemispheres(self.device, points, normals, keys, rings, sectors, fill)
 
     def at_hits(self, hits: np.ndarray, rays: int) -> wp.array:
         """See `IrradianceSource`."""
@@ -125,7 +125,7 @@ class SplatSource:
         return self.reconstruction.irradiance_at(hits, rays)
 
 
-def _irradiance(
+def sum_hemispheres(
     device: Device, points: np.ndarray, normals: np.ndarray, keys: np.ndarray, rings: int, sectors: int, fill
 ) -> Irradiance:
     """Sums over strata that `fill` fills, some points at a time."""

@@ -23,8 +23,12 @@ from warpgi.records import Records
 from warpgi.samples import NO_HIT
 from warpgi.splat_tree import SplatTree
 
-# Pixels between those of the coarsest grid.
+#: Pixels between those of the coarsest grid.
 COARSEST = 32
+# Of eight pixels around one with a record, those that must show the same surface.
+SUPPORT = 3
+# Device bytes of a primary hit: irradiance, what it reflects, a mark.
+BYTES_PER_HIT = 2 * 12 + 4
 # A record in front of which a point lies by more than this part of its radius is not used for it.
 FRONT = 0.01
 
@@ -36,10 +40,10 @@ KERNELS = (kernels.interpolate, sum_strata, bvh.fill_blocks)
 class Caching:
     """How records are placed and used."""
 
-    error: float
+    tolerance: float
     """a: a record serves where its error is below (Ward et al. 1988)."""
     overlap: float
-    """Interpolation takes records of up to so many times that error."""
+    """Interpolation takes records of up to so many times that tolerance."""
     spread: float
     """Relative standard deviation of what records say, above which there is to be one more."""
     rays: int
@@ -50,11 +54,8 @@ class Caching:
     """Largest radius of a record in pixels."""
     finest: int
     """Pixels between those of the finest grid; what it leaves without a record is gathered hit by hit."""
-    support: int
-    """Of eight pixels around, those that must show the same surface."""
     gradients: bool
     """Extrapolate records by their gradients."""
-
 
     @property
     def rings(self) -> int:
@@ -117,16 +118,20 @@ class RecordCache:
         self._struct = kernels.Hits()
         self._struct.origins, self._struct.normals = (device.array(a, wp.vec3) for a in (hits.origin, hits.normal))
         self._struct.per_pixel, (self._struct.width, self._struct.height) = hits.per_pixel, size
-        met = np.abs(hits.origin).max(axis=1) < NO_HIT
-        largest = float(np.abs(hits.origin[met]).max(initial=1e-30))
+        x, y, z = np.abs(hits.origin).T
+        reach = np.maximum(np.maximum(x, y), z)
+        met = reach < NO_HIT
+        largest = float(reach[met].max(initial=1e-30))
         self.noise = NOISE_ULPS * largest
         self._build()
+        self.rounds_done = 0
         self.counts = {"records": len(self.records), "fallback_hits": 0, "hits": int(np.count_nonzero(met))}
 
     def fill(self, first: int, count: int) -> None:
         """Makes the records of rounds `first` to `first + count - 1`."""
         for places in self.rounds[first : first + count]:
             self._fill_round(places)
+        self.rounds_done = first + count
 
     def reflected(self, fallback_rays: int) -> wp.array:
         """Indirect light that each primary hit reflects, vec3 on the device.
@@ -139,11 +144,12 @@ class RecordCache:
         irradiance, reflected = (device.zeros(count, wp.vec3) for _ in range(2))
         uncovered = device.zeros(count, int)
         device.launch(kernels.interpolate, pixels, [self._kernel_records, hits, 0], [irradiance, uncovered])
-        self.last_uncovered = uncovered.numpy()
         alone = np.flatnonzero(uncovered.numpy()).astype(np.int32)
         self.counts["fallback_hits"] = len(alone)
         if len(alone):
-            values = self.source.at_hits(alone, max(1, round(fallback_rays / self._hits.per_pixel)))
+            # an unfinished cache leaves many, and is to be shown soon
+            rays = fallback_rays if self.rounds_done == len(self.rounds) else 1
+            values = self.source.at_hits(alone, max(1, round(rays / self._hits.per_pixel)))
             device.launch(kernels.place_irradiance, len(alone), [values, device.array(alone, int)], [irradiance])
         device.launch(kernels.reflect_irradiance, count, [irradiance, self._albedo], [reflected])
         return reflected
@@ -167,7 +173,7 @@ class RecordCache:
         candidates = np.concatenate(grids).astype(np.int32)
         wanted, footprint = device.zeros(len(candidates), int), device.zeros(len(candidates), float)
         inputs = [self._kernel_records, self._struct, device.array(candidates, int)]
-        inputs += [caching.error, caching.spread, caching.support]
+        inputs += [caching.tolerance, caching.spread, SUPPORT]
         device.launch(kernels.find_uncovered, len(candidates), inputs, [wanted, footprint])
         new = np.flatnonzero(wanted.numpy() >= 0)
         if not len(new):
@@ -196,9 +202,9 @@ class RecordCache:
         radius = clamped.numpy()
         tree = SplatTree(device, positions, normals, values, np.arange(count, dtype=np.int32), self.noise)
         order = tree.order.numpy()
-        most = caching.error * caching.overlap
+        most = caching.tolerance * caching.overlap
         tree.set_radius2(device.array(np.square(most * radius[order]), float))
-        tree.refit(balls=True)
+        tree.refit_as_balls()
         packed = records.packed()
         packed[:, 0] = radius
         struct = kernels.Records()

@@ -64,9 +64,9 @@ class Records:
     ) -> Records:
         """Records at points where irradiance is known, their radii by distances and gradients.
 
-        The radius is the harmonic mean distance of what surrounds the point (Ward et al. 1988), and no larger than where
-        the gradient alone would change all of the value; then it is put between `smallest` and `largest` (Tabellion,
-        Lamorlette 2004), shape (N,) each, and gradients are made smaller where they would do so within it.
+        The radius is the harmonic mean distance of what surrounds the point (Ward et al. 1988), and no larger than
+        where the gradient alone would change all of the value; then it is put between `smallest` and `largest`
+        (Tabellion, Lamorlette 2004), shape (N,) each, and gradients are made smaller where they would do so within it.
         """
         mean = known.value.mean(axis=1)
         slope = np.linalg.norm(known.translation.mean(axis=1), axis=1)

@@ -89,7 +89,8 @@ def trace_primary_hits(job: Job, film: Film, hits: int, light_samples: int, path
     """Traces a picture's primary hits alone; positions stay relative to the device's origin. Direct light, and all
     light of surfaces that are not diffuse, goes to the film."""
     arrays = _trace(job, film, hits, 0, light_samples, paths, dict.fromkeys(PRIMARY, wp.vec3), {})
-    return PrimaryHits(*(getattr(arrays, name).numpy() for name in PRIMARY), hits)
+    origin, normal, albedo = (getattr(arrays, name).numpy() for name in PRIMARY)
+    return PrimaryHits(origin, normal, albedo, hits)
 
 
 def _trace(

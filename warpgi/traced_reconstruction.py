@@ -35,15 +35,13 @@ class TracedReconstruction(Reconstruction):
         return np.zeros(3, np.float32)
 
     def _fit(self) -> None:
-        self.tree.refit(balls=True)
+        self.tree.refit_as_balls()
 
     def _send(self, hemispheres: Hemispheres, count: int, outputs: list[wp.array]) -> None:
         inputs = [self.scene.struct, self.tree.struct, hemispheres, self.seed, self.step, self.noise]
         self.device.launch(traced_gather.trace_splat_strata, count, inputs, outputs)
 
-    def _trace(
-        self, receivers: Receivers, gathered: Gathered, size: int, first: int, count: int, each: int
-    ) -> None:
+    def _trace(self, receivers: Receivers, gathered: Gathered, size: int, first: int, count: int, each: int) -> None:
         inputs = [self.scene.struct, self.tree.struct, receivers, each, first, count, self.seed, self.step, self.noise]
         self.device.launch(traced_gather.gather_traced, size, inputs, [gathered])
         self.counts["reconstruction_rays"] += size * count

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import warp as wp
@@ -12,6 +14,7 @@ from warpgi.cached_reconstruction import CachedReconstruction
 from warpgi.device import Device
 from warpgi.device_scene import DeviceScene
 from warpgi.film import Film
+from warpgi.irradiance import STRATA_BYTES
 from warpgi.job import Job
 from warpgi.kernels.light_field import add_reflected
 from warpgi.kernels.primary_samples import trace_primary_samples
@@ -21,8 +24,6 @@ from warpgi.lens_reconstruction import PRIMARY_SAMPLE_BYTES, LensReconstruction
 from warpgi.methods.irradiance_cache import IrradianceCache
 from warpgi.methods.path import NEVER, Sampler, check_paths
 from warpgi.methods.photon_map import PhotonMap, light_by_photons
-from warpgi.record_cache import KERNELS as CACHE_KERNELS
-from warpgi.record_cache import Caching
 from warpgi.reconstruction import (
     BYTES_PER_HIT,
     BYTES_PER_SAMPLE,
@@ -32,6 +33,9 @@ from warpgi.reconstruction import (
     Reconstruction,
     pixel_means,
 )
+from warpgi.record_cache import BYTES_PER_HIT as CACHE_BYTES_PER_HIT
+from warpgi.record_cache import KERNELS as CACHE_KERNELS
+from warpgi.record_cache import Caching
 from warpgi.samples import SampleBuffer
 from warpgi.sampling import PRIMARY_BYTES, SECONDARY_BYTES, trace_primary_buffer, trace_sample_buffer
 from warpgi.traced_reconstruction import KERNELS as TRACED_KERNELS
@@ -78,12 +82,12 @@ class LightField:
     cache: bool = False
     """Gather at the records of an irradiance cache instead of every primary hit, and interpolate between them; `rays`
     are then those of pixels where the cache would interpolate across too much, such as foliage."""
-    error: float = 0.3
-    """Allowed error of a record (see `IrradianceCache`), with `cache`; time grows about with its inverse square."""
+    tolerance: float = 0.3
+    """With `cache`: error up to which a record serves, see `IrradianceCache`."""
     scene_rays: bool = True
     """With `cache`, and where a scene is at hand: let it stop the rays of records, and splats only light them."""
     record_rays: int = 256
-    """Reconstruction rays of a record, with `cache`."""
+    """With `cache`: rays of a record."""
     light_samples: int = 32
     """Shadow rays to lights per pixel, shared out over its primary hits, which make the direct light."""
     max_depth: int | None = None
@@ -108,6 +112,10 @@ class LightField:
         checks.count("recursive_rays", self.recursive_rays)
         checks.count("photons", self.photons, 0)
         checks.count("light_samples", self.light_samples)
+        checks.number("tolerance", self.tolerance, 0.0, open_lower=True)
+        checks.count("record_rays", self.record_rays)
+        if self.cache and self.primary_rays:
+            raise ValueError("cache and primary_rays are both set, expected one: a cache is for light on surfaces")
         if self.primary_hits is not None:
             checks.count("primary_hits", self.primary_hits, self.spp)
         check_paths(self.max_depth, self.roulette_depth, self.sampler)
@@ -127,8 +135,9 @@ class LightField:
         """What it launches."""
         if self.primary_rays:
             return (trace_primary_samples,)  # lens reconstruction loads its own, those for motion where it needs them
-        more = (*(PhotonMap().kernels if self.photons else ()), *((*CACHE_KERNELS, *TRACED_KERNELS) if self.cache else ()))
-        return (trace_samples, *KERNELS, *more)
+        photons = PhotonMap().kernels if self.photons else ()
+        cache = (*CACHE_KERNELS, *TRACED_KERNELS) if self.cache else ()
+        return (trace_samples, *KERNELS, *photons, *cache)
 
     @property
     def preprocessing(self) -> Preprocessing:
@@ -138,8 +147,7 @@ class LightField:
     @property
     def caching(self) -> Caching:
         """How records are placed."""
-        settings = IrradianceCache(rays=self.record_rays, error=self.error).caching
-        return settings
+        return IrradianceCache(rays=self.record_rays, tolerance=self.tolerance).caching
 
     @property
     def hits(self) -> int:
@@ -160,6 +168,8 @@ class LightField:
             return size[0] * size[1] * self.spp * PRIMARY_SAMPLE_BYTES
         hit, ray = PRIMARY_BYTES + BYTES_PER_HIT, SECONDARY_BYTES + BYTES_PER_SAMPLE
         photons = PhotonMap(photons=self.photons).device_bytes(size) if self.photons else 0
+        if self.cache:
+            hit, photons = hit + CACHE_BYTES_PER_HIT + PRIMARY_BYTES, photons + STRATA_BYTES
         return size[0] * size[1] * (self.hits * hit + self.spp * ray) + photons
 
     def prepare(self, job: Job, film: Film) -> AnyReconstruction:
@@ -196,12 +206,18 @@ class LightField:
         """Splats made of a sample buffer, ready for `gather`."""
         if self.primary_rays:
             return LensReconstruction(samples, device, self.preprocessing, seed)
-        arguments = (samples, device, self.preprocessing, seed, hits)
-        recursion = {"recursions": self.recursive, "recursive_rays": self.recursive_rays}
+        make: Callable[..., Reconstruction] = Reconstruction
         if self.cache and self.scene_rays and scene is not None:
-            splats: Reconstruction = TracedReconstruction(scene, *arguments, **recursion)
-        else:
-            splats = Reconstruction(*arguments, **recursion)
+            make = partial(TracedReconstruction, scene)
+        splats = make(
+            samples,
+            device,
+            self.preprocessing,
+            seed,
+            hits,
+            recursions=self.recursive,
+            recursive_rays=self.recursive_rays,
+        )
         return CachedReconstruction(splats, hits, self.caching, self.rays) if self.cache else splats
 
     def estimate(self, job: Job, state: AnyReconstruction, film: Film, first: int, count: int) -> None:
