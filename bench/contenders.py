@@ -37,6 +37,7 @@ LADDERS: dict[str, tuple[Settings, ...]] = {
             (64, 400_000, 16),
         )
     ),
+    "instant-radiosity": tuple({"paths": paths} for paths in (10, 32, 64, 256, 1024)),
     "a-trous": powers(64),
     "random-parameter-filter": powers(16),
     "irradiance-filter": powers(64),

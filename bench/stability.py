@@ -12,13 +12,19 @@ from rich.table import Table
 
 import warpgi as gi
 from bench.chart_page import PAGE, RESULTS, STABILITY, write_page
-from bench.failures import ambient_occlusion, light_field, path, photon_map
+from bench.failures import ambient_occlusion, instant_radiosity, light_field, path, photon_map
 from bench.failures.failure import Failure
 from bench.report import circumstances, finite, progress
 from warpgi.image import atomic_write
 
 #: All rows; a method adds those of its own file.
-FAILURES: tuple[Failure, ...] = (*path.ROWS, *light_field.ROWS, *ambient_occlusion.ROWS, *photon_map.ROWS)
+FAILURES: tuple[Failure, ...] = (
+    *path.ROWS,
+    *light_field.ROWS,
+    *ambient_occlusion.ROWS,
+    *photon_map.ROWS,
+    *instant_radiosity.ROWS,
+)
 
 PASS, FAIL, OPEN = "pass", "fail", "open"
 

@@ -171,6 +171,28 @@ def base_share(shape: ShapeRecord, albedo: wp.vec3, n: wp.vec3, wo: wp.vec3, wi:
 
 
 @wp.func
+def has_base(kind: int):
+    """Whether a surface has a diffuse layer, of which an irradiance says all."""
+    return kind == DIFFUSE or kind == COATED
+
+
+@wp.func
+def base_entry(shape: ShapeRecord, n: wp.vec3, wi: wp.vec3):
+    """Part of the light from wi that comes to the diffuse layer, which reflects it by `base_reflectance`."""
+    if shape.kind == COATED:
+        return (1.0 - coat_albedo(shape, wp.dot(n, wi))) * shape.coat[1]
+    return 1.0
+
+
+@wp.func
+def base_reflectance(shape: ShapeRecord, albedo: wp.vec3, n: wp.vec3, wo: wp.vec3):
+    """pi times the radiance towards wo that the diffuse layer makes of each unit of irradiance that came to it."""
+    if shape.kind == COATED:
+        return base_albedo(shape, albedo) * (1.0 - coat_albedo(shape, wp.dot(n, wo)))
+    return albedo
+
+
+@wp.func
 def coat_probability(shape: ShapeRecord, cos_o: float):
     """Chance that the coat of Coated is sampled, as if its base reflected half of what it gets."""
     e = coat_albedo(shape, cos_o)
@@ -193,6 +215,40 @@ def evaluate(shape: ShapeRecord, albedo: wp.vec3, n: wp.vec3, wo: wp.vec3, wi: w
     if shape.kind == COATED:
         return base_value(shape, albedo, n, wo, wi) + wp.vec3(coat_value(shape, n, wo, wi))
     return wp.vec3(0.0)
+
+
+@wp.func
+def is_wide(shape: ShapeRecord, exponent: float):
+    """Whether all light is scattered by lobes no sharper than `exponent`."""
+    if shape.kind == CONDUCTOR or shape.kind == COATED:
+        return shape.exponent <= exponent
+    return shape.kind == DIFFUSE
+
+
+@wp.func
+def has_wide_lobe(shape: ShapeRecord, exponent: float):
+    """Whether some is; the base of Coated is such at any exponent."""
+    return shape.kind == COATED or is_wide(shape, exponent)
+
+
+@wp.func
+def wide_share(shape: ShapeRecord, albedo: wp.vec3, n: wp.vec3, wo: wp.vec3, wi: wp.vec3, exponent: float):
+    """Part of the light from wi that comes to wo by lobes no sharper than `exponent`."""
+    if is_wide(shape, exponent):
+        return wp.vec3(1.0)
+    return base_share(shape, albedo, n, wo, wi)
+
+
+@wp.func
+def wide_value(shape: ShapeRecord, albedo: wp.vec3, n: wp.vec3, wo: wp.vec3, wi: wp.vec3, exponent: float):
+    """f cos of these lobes alone."""
+    if shape.kind == COATED and shape.exponent > exponent:
+        if wp.dot(n, wo) <= 0.0 or wp.dot(n, wi) <= 0.0:
+            return wp.vec3(0.0)
+        return base_value(shape, albedo, n, wo, wi)
+    if not has_wide_lobe(shape, exponent):
+        return wp.vec3(0.0)
+    return evaluate(shape, albedo, n, wo, wi)
 
 
 @wp.func

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warpgi.kernels.bsdf import sample
+from warpgi.kernels.bsdf import base_entry, base_reflectance, base_share, has_base, is_delta, sample
 from warpgi.kernels.bvh import BLOCK_STRIDE, LANES, RADIUS_ROW
 from warpgi.kernels.camera import Camera
 from warpgi.kernels.density import GUESS_NEARBY, Density, Lookup, density, nearest_photons, nearest_place, vec8
@@ -12,7 +12,7 @@ from warpgi.kernels.path import CAMERA_PAIRS, VERTEX_PAIRS, add_light, pixel_ray
 from warpgi.kernels.rng import SOBOL_PAIRS, Sampler, make_sampler, sample_2d
 from warpgi.kernels.sampling import INV_PI, PI, make_frame, square_to_cosine_hemisphere, to_world
 from warpgi.kernels.scene import (
-    CONDUCTOR,
+    COATED,
     DIELECTRIC,
     DIFFUSE,
     FAR,
@@ -172,12 +172,17 @@ def incident_light(
             n = facing_normal(s, wo)
         pair = GATHER_PAIR + 4 * step
         direct = 0
-        if shape.kind == DIFFUSE:
-            side = s.ng * wp.sign(wp.dot(s.ng, wo))
+        read = int(0)
+        side = s.ng * wp.sign(wp.dot(s.ng, wo))
+        if has_base(shape.kind):
             found = irradiance_near(maps, s.p, side)
-            if near >= MAX_NEAR or travelled * travelled >= maps.near * found.radius2:
-                reflected = wp.cw_mul(throughput, wp.cw_mul(s.albedo, found.irradiance)) * INV_PI
-                result.radiance = result.radiance + reflected
+            # what coats reflect straight from lights is in the caustics, which is why they are not traced on
+            if shape.kind == COATED or near >= MAX_NEAR or travelled * travelled >= maps.near * found.radius2:
+                reflectance = wp.cw_mul(throughput, base_reflectance(shape, s.albedo, n, wo))
+                result.radiance = result.radiance + wp.cw_mul(reflectance, found.irradiance) * INV_PI
+                read = 1
+        if shape.kind == DIFFUSE:
+            if read == 1:
                 break
             near = near + 1
             travelled = 0.0
@@ -195,6 +200,12 @@ def incident_light(
         if wp.max(b.weight) <= 0.0 or (b.transmitted == 0 and not reflects(s, wo, b.wi)):
             break
         throughput = wp.cw_mul(throughput, b.weight)
+        if shape.kind == COATED:
+            coat = wp.vec3(1.0) - base_share(shape, s.albedo, n, wo, b.wi)
+            survival = wp.min(wp.max(wp.cw_mul(coat, b.weight)), 1.0)
+            if sample_2d(sampler, pair + 3)[0] >= survival:
+                break
+            throughput = wp.cw_mul(throughput, coat) / survival
         pdf = b.pdf
         o = offset_origin(s.p, s.ng, s.offset, b.wi)
         d = b.wi
@@ -302,6 +313,7 @@ def follow(scene: Scene, maps: Maps, view: View, pixel: int, index: int, sampler
     path.depth = -1.0
     throughput = wp.vec3(1.0)
     bsdf_pdf = float(0.0)
+    coat = wp.vec3(1.0)  # part of the reflection at the last surface that is not its diffuse layer's
     depth = int(1)
     while True:
         hit = closest_hit(scene, o, d)
@@ -324,18 +336,31 @@ def follow(scene: Scene, maps: Maps, view: View, pixel: int, index: int, sampler
         if shape.kind != DIELECTRIC:
             n = facing_normal(s, wo)
         pair = CAMERA_PAIRS + VERTEX_PAIRS * (depth - 1)
+        extra = sample_2d(sampler, pair + 2)
+        part = wp.max(coat)
+        if part < 1.0:
+            if extra[1] >= part:
+                break
+            throughput = wp.cw_mul(throughput, coat) / part
+            coat = wp.vec3(1.0)
 
-        if shape.kind == DIFFUSE:
-            # direct light, by lights and by directions (Veach 1997)
-            rays = wp.where(view.gather > 0, view.gather, wp.where(scene.visible_light != 0, view.light_samples, 0))
+        light_part = float(1.0)
+        if has_base(shape.kind):
+            # direct light, by lights and by directions (Veach 1997): of a coat by that which the path takes
+            rays = int(view.gather)
+            searching = float(1.0)
             light_part = 1.0 / float(view.light_samples)
+            if shape.kind == DIFFUSE:
+                if view.gather == 0 and scene.visible_light != 0:
+                    rays = view.light_samples
+                searching = float(rays)
             ray_part = 1.0 / float(wp.max(rays, 1))
             if scene.light_count > 0:
                 for j in range(view.light_samples):
                     light_sampler = make_sampler(view.seed, pixel, index * view.light_samples + j, view.sampler)
                     u = sample_2d(light_sampler, pair)
                     choice = sample_2d(light_sampler, pair + 2)[0]
-                    light = direct_light(scene, shape, s, n, wo, u, choice, float(rays) * light_part)
+                    light = direct_light(scene, shape, s, n, wo, u, choice, searching * light_part)
                     path.shadow_rays = path.shadow_rays + light.shadow_rays
                     path = add_light(path, depth + 1, wp.cw_mul(throughput, light.radiance) * light_part)
             side = s.ng * wp.sign(wp.dot(s.ng, wo))  # discs lie on the real surface
@@ -346,7 +371,7 @@ def follow(scene: Scene, maps: Maps, view: View, pixel: int, index: int, sampler
                 found = density(maps.diffuse, scene, maps.diffuse_look, s.p, side, 0.0, pixel, index)
                 path.closest_hit_rays = path.closest_hit_rays + found.rays
                 irradiance = irradiance + found.irradiance
-            reflectance = wp.cw_mul(throughput, s.albedo)
+            reflectance = wp.cw_mul(throughput, base_reflectance(shape, s.albedo, n, wo))
             for ray in range(rays):
                 number = index * rays + ray
                 wi = gather_direction(view.seed, view.sampler, pixel, number, n)
@@ -358,26 +383,29 @@ def follow(scene: Scene, maps: Maps, view: View, pixel: int, index: int, sampler
                         incident = incident_light(scene, maps, ray_sampler, pixel, index, o, wi, ray_pdf)
                         path.closest_hit_rays = path.closest_hit_rays + incident.closest_hit_rays
                         path.shadow_rays = path.shadow_rays + incident.shadow_rays
-                        path = add_light(path, depth + 1, wp.cw_mul(reflectance, incident.direct) * ray_part)
-                        path = add_light(path, depth + 2, wp.cw_mul(reflectance, incident.radiance) * ray_part)
+                        if shape.kind == DIFFUSE:
+                            path = add_light(path, depth + 1, wp.cw_mul(reflectance, incident.direct) * ray_part)
+                        gathered = incident.radiance * (base_entry(shape, n, wi) * ray_part)
+                        path = add_light(path, depth + 2, wp.cw_mul(reflectance, gathered))
                     else:
                         path.closest_hit_rays = path.closest_hit_rays + 1
                         seen = visible_light(scene, o, wi, ray_pdf)
                         path = add_light(path, depth + 1, wp.cw_mul(reflectance, seen) * ray_part)
             path = add_light(path, depth + 2, wp.cw_mul(reflectance, irradiance) * INV_PI)
-            break
-
-        # anything else: rough metal samples lights as well
-        b = sample(shape, s.albedo, n, wo, sample_2d(sampler, pair + 1))
-        if shape.kind == CONDUCTOR and scene.light_count > 0:
-            choice = sample_2d(sampler, pair + 2)[0]
-            light = direct_light(scene, shape, s, n, wo, sample_2d(sampler, pair), choice, 1.0)
+            if shape.kind == DIFFUSE:
+                break
+        elif not is_delta(shape.kind) and scene.light_count > 0:
+            light = direct_light(scene, shape, s, n, wo, sample_2d(sampler, pair), extra[0], 1.0)
             path.shadow_rays = path.shadow_rays + light.shadow_rays
             path = add_light(path, depth + 1, wp.cw_mul(throughput, light.radiance))
+
+        # on, by what is not diffuse
+        b = sample(shape, s.albedo, n, wo, sample_2d(sampler, pair + 1))
         if wp.max(b.weight) <= 0.0 or (b.transmitted == 0 and not reflects(s, wo, b.wi)):
             break
         throughput = wp.cw_mul(throughput, b.weight)
-        bsdf_pdf = b.pdf
+        coat = wp.vec3(1.0) - base_share(shape, s.albedo, n, wo, b.wi)
+        bsdf_pdf = b.pdf * light_part
         o = offset_origin(s.p, s.ng, s.offset, b.wi)
         d = b.wi
         depth = depth + 1

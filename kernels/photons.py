@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warpgi.kernels.bsdf import sample
+from warpgi.kernels.bsdf import base_entry, base_share, has_base, has_wide_lobe, sample
 from warpgi.kernels.direct import facing_normal, reflects
 from warpgi.kernels.film import is_finite
 from warpgi.kernels.lights import light_probability, pick_light
@@ -15,11 +15,21 @@ from warpgi.kernels.sampling import (
     square_to_triangle,
     to_world,
 )
-from warpgi.kernels.scene import DIELECTRIC, DIFFUSE, Scene, closest_hit, offset_origin, ray_offset, surface_at
+from warpgi.kernels.scene import (
+    COATED,
+    DIELECTRIC,
+    DIFFUSE,
+    Hit,
+    Scene,
+    closest_hit,
+    offset_origin,
+    ray_offset,
+    surface_at,
+)
 
 wp.set_module_options({"enable_backward": False})
 
-# How light came to a photon's place; S is any surface that is not diffuse.
+# How light came to a photon's place; D is a diffuse surface or the base of a coated one, S any other.
 DIRECT = wp.constant(0)  # L D
 CAUSTIC = wp.constant(1)  # L S+ D
 INDIRECT = wp.constant(2)  # any other
@@ -48,6 +58,7 @@ class Emission:
     radius: float  # of a sphere around the scene
     environment: float  # probability that the environment emits
     caustics: int  # 1: only what reaches a diffuse surface over others; a path ends there
+    sharpest: float  # exponent up to which glossy lobes leave photons too, 0: none do
     aim_cdf: wp.array[float]  # running sum over cells of their probability; empty: all alike
 
 
@@ -57,6 +68,10 @@ class Photons:
     normal: wp.array[wp.vec3]  # of the real surface, on the side that the light came from
     flux: wp.array[wp.vec3]  # [W]
     kind: wp.array[int]  # DIRECT, CAUSTIC or INDIRECT
+    # for those who read them as lights; empty for others
+    face: wp.array[int]
+    bary: wp.array[wp.vec2]  # of the triangle's first and second corner
+    incident: wp.array[wp.vec3]  # towards where the light came from
 
 
 @wp.struct
@@ -182,6 +197,18 @@ def emit(scene: Scene, emission: Emission, sampler: Sampler):
     return beam
 
 
+@wp.func
+def store(photons: Photons, k: int, p: wp.vec3, ng: wp.vec3, flux: wp.vec3, kind: int, hit: Hit, wo: wp.vec3):
+    photons.position[k] = p
+    photons.normal[k] = ng
+    photons.flux[k] = flux
+    photons.kind[k] = kind
+    if photons.face.shape[0] > 0:
+        photons.face[k] = hit.face
+        photons.bary[k] = wp.vec2(hit.u, hit.v)
+        photons.incident[k] = wo
+
+
 @wp.struct
 class Track:
     """What became of one path."""
@@ -225,23 +252,20 @@ def trace_photons(scene: Scene, emission: Emission, path: int, photons: Photons,
         pair = EMISSION_PAIRS + SCATTER_PAIRS * depth
         left = wp.vec3(0.0)
         d = wp.vec3(0.0)
-        if shape.kind == DIFFUSE:
-            # the sides of the normals that the light came to
-            side = wp.sign(wp.dot(s.ng, wo))
-            ng = s.ng * side
-            ns = s.n * side
-            arrived = flux * (wp.max(wp.dot(ns, wo), 0.0) / cos_real)
+        # the sides of the normals that the light came to
+        side = wp.sign(wp.dot(s.ng, wo))
+        ng = s.ng * side
+        ns = s.n * side
+        if shape.kind == DIFFUSE or (emission.sharpest == 0.0 and has_base(shape.kind)):
+            arrived = flux * (wp.max(wp.dot(ns, wo), 0.0) / cos_real * base_entry(shape, n, wo))
             if not is_finite(flux):
                 track.dropped = track.dropped + 1
                 break
             if wp.max(arrived) > 0.0 and (emission.caustics == 0 or kind == CAUSTIC):
                 if track.stored < room:
-                    k = place + track.stored
-                    photons.position[k] = s.p
-                    photons.normal[k] = ng
-                    photons.flux[k] = arrived
-                    photons.kind[k] = kind
+                    store(photons, place + track.stored, s.p, ng, arrived, kind, hit, wo)
                 track.stored = track.stored + 1
+        if shape.kind == DIFFUSE:
             if emission.caustics != 0:
                 break
             kind = int(INDIRECT)
@@ -250,8 +274,10 @@ def trace_photons(scene: Scene, emission: Emission, path: int, photons: Photons,
             seen = wp.where(wp.dot(ns, d) > 0.0, ns, ng)
             left = wp.cw_mul(flux, s.albedo) * (wp.max(wp.dot(seen, wo), 0.0) / cos_real)
         else:
-            if kind == DIRECT:
-                kind = int(CAUSTIC)
+            if emission.sharpest > 0.0 and has_wide_lobe(shape, emission.sharpest) and is_finite(flux):
+                if track.stored < room:
+                    store(photons, place + track.stored, s.p, ng, flux, kind, hit, wo)
+                track.stored = track.stored + 1
             b = sample(shape, s.albedo, n, wo, sample_2d(sampler, pair))
             cos_shading = wp.abs(wp.dot(n, b.wi))
             if wp.max(b.weight) <= 0.0 or cos_shading == 0.0 or (b.transmitted == 0 and not reflects(s, wo, b.wi)):
@@ -262,6 +288,22 @@ def trace_photons(scene: Scene, emission: Emission, path: int, photons: Photons,
             )
             if b.transmitted != 0:
                 left = left * (b.eta * b.eta)  # radiance shrinks by that where it is refracted, flux does not
+            by_base = int(0)
+            if shape.kind == COATED and emission.sharpest == 0.0:
+                # which of the layers it came from, so that every photon is of one kind
+                share = base_share(shape, s.albedo, n, wo, d)
+                part = (share[0] + share[1] + share[2]) / 3.0
+                if emission.caustics != 0:
+                    left = wp.cw_mul(left, wp.vec3(1.0) - share)
+                elif sample_2d(sampler, pair + 1)[1] < part:
+                    left = wp.cw_mul(left, share) / part
+                    by_base = int(1)
+                else:
+                    left = wp.cw_mul(left, wp.vec3(1.0) - share) / (1.0 - part)
+            if by_base == 1:
+                kind = int(INDIRECT)
+            elif kind == DIRECT:
+                kind = int(CAUSTIC)
 
         # roulette
         survival = wp.min(wp.max(left) / wp.max(flux), 1.0)
@@ -322,3 +364,7 @@ def pack(
         photons.normal[start + j] = batch.normal[i * slots + j]
         photons.flux[start + j] = batch.flux[i * slots + j]
         photons.kind[start + j] = batch.kind[i * slots + j]
+        if photons.face.shape[0] > 0:
+            photons.face[start + j] = batch.face[i * slots + j]
+            photons.bary[start + j] = batch.bary[i * slots + j]
+            photons.incident[start + j] = batch.incident[i * slots + j]

@@ -26,7 +26,8 @@ class SplatTree:
 
 # The search for what is nearest to (cx, cy, cz) in the metric |d|^2 + stretch (d.n)^2: every lane that ACCEPT takes and
 # that is nearer than `worst` is handed to KEEP, which lowers `worst`. `block0` is where to begin, -1: at the root. NODE
-# sees each node (`p`, and its `first` child) before its children.
+# sees each node (`p`, and its `first` child) before its children, of which it enters those that ENTER takes; BLOCK sees
+# each block before its lanes.
 SEARCH_HEAD = """
     int stack[128];
     float entry[128];
@@ -56,6 +57,7 @@ SEARCH_HEAD = """
         }
         if (block >= 0) {
             const float* p = tree.blocks.data + (size_t)block * 80;
+            BLOCK
             float d2[8], m2[8];
             int met[8];
             for (int j = 0; j < 8; ++j) {
@@ -84,7 +86,7 @@ SEARCH_TAIL = """
                 const float dy = larger(larger(p[8 + j] - cy, cy - p[32 + j]), 0.0f);
                 const float dz = larger(larger(p[16 + j] - cz, cz - p[40 + j]), 0.0f);
                 d2[j] = dx * dx + dy * dy + dz * dz;
-                met[j] = (int)(d2[j] < worst);
+                met[j] = (int)((d2[j] < worst)ENTER);
             }
             const int base = top;
             unsigned mask = lane_mask(met);
@@ -104,9 +106,13 @@ SEARCH_TAIL = """
 """
 
 
-def search(keep: str, accept: str = "", node: str = "") -> str:
-    """Native code of the search: what to do with a lane, a further test of lanes, and what to do at a node."""
-    return SEARCH_HEAD.replace("ACCEPT", accept) + keep + SEARCH_TAIL.replace("NODE", node)
+def search(keep: str, accept: str = "", node: str = "", enter: str = "", block: str = "") -> str:
+    """Native code of the search: what to do with a lane and a further test of lanes; what to do at a node and a further
+    test of its children; what to do at a block."""
+    head, tail = SEARCH_HEAD, SEARCH_TAIL
+    for name, code in (("ACCEPT", accept), ("BLOCK", block), ("NODE", node), ("ENTER", enter)):
+        head, tail = head.replace(name, code), tail.replace(name, code)
+    return head + keep + tail
 
 
 # Squared distance to the k-th neighbour in that metric, the sample itself counted, and in Euclid's; samples at the
@@ -259,10 +265,8 @@ def shrink_crossed(
 # conflicts where its event line meets the st plane in the positive, or in the negative, half-spaces of both (with the
 # authors' erratum); that is a b depth_i depth_j > 0 for a = (h_j - h_i).n_i and b = (h_j - h_i).n_j.
 # `keep_one` and `keep_two` are squared parts of their radius that splats keep which are alone, or two, in the surface.
-# Returns radiance times weight (3), weight, weight of splats nearer than `reach`, splats in the surface, whether
-# the gather was cut short, how many undersampled surfaces were passed through, the distance of a surface whose
-# splats all face away, else 0, and the surface's weighted distance times weight.
-SURFACE = (
+# What follows finds `size` splats, of which those with t_of < limit, `inside` of them, are the surface.
+FIND_SURFACE = (
     WALK_HEAD
     + """
     float hx[72], hy[72], hz[72], gx[72], gy[72], gz[72], depth[72], t_of[72], e_of[72];
@@ -388,6 +392,10 @@ SURFACE = (
         }
         ++surfaces_passed;
     }
+"""
+)
+# The tent-weighted mean of the surface's radiance.
+TENT_MEAN = """
     bool any_front = false;
     for (int j = 0; j < size; ++j)
         any_front = any_front | ((t_of[j] < limit) & (place[j] >= 0));
@@ -412,6 +420,14 @@ SURFACE = (
         for (int j = 0; j < size; ++j)
             seen_behind = smaller(seen_behind, t_of[j]);
     }
+"""
+# Returns radiance times weight (3), weight, weight of splats nearer than `reach`, splats in the surface, whether
+# the gather was cut short, how many undersampled surfaces were passed through, the distance of a surface whose
+# splats all face away, else 0, and the surface's weighted distance times weight.
+SURFACE = (
+    FIND_SURFACE
+    + TENT_MEAN
+    + """
     wp::vec_t<10, wp::float32> result;
     result[0] = r; result[1] = g; result[2] = b; result[3] = weight; result[4] = within;
     result[5] = (float)inside; result[6] = (float)cut; result[7] = (float)surfaces_passed;

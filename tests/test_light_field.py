@@ -257,9 +257,10 @@ def test_an_empty_buffer_is_a_picture_or_a_sentence():
         np.testing.assert_array_equal(picture.layers["indirect"], np.zeros((3, 4, 3), np.float32))
 
 
-def test_scenes_without_diffuse_surfaces_render():
-    """A scene of metal alone keeps its path-traced light: the same layers as the input's own."""
-    scene = gi.scenes.statuettes(resolution=16)
+def test_scenes_without_rough_surfaces_render():
+    """A scene of mirrors alone keeps its path-traced light: nothing is sampled, and the picture is there."""
+    scene = gi.scenes.statuettes(resolution=16, sky=0.3)
+    scene = replace(scene, shapes=[replace(shape, material=gi.Mirror(0.9)) for shape in scene.shapes])
     picture = gi.render(scene, light_field(), size=(24, 18))
     assert np.isfinite(picture.image).all() and picture.layers["indirect"].max() > 0.0
     assert picture.counts["splats"] == 0

@@ -141,11 +141,17 @@ def test_caustic_of_a_glass_ball():
 
 
 def test_pictures_agree_with_path_tracing():
-    """Mirrors, glass, rough metal, sun, sky: photon maps show what paths show, but for noise and some blur."""
+    """Mirrors, glass, rough metal, coats, sun, sky: photon maps show what paths show, but for noise and some blur."""
     size = (32, 32)
     metal = caustic(lamp_radius=0.3, roughness=0.2)
     open_air = dataclasses.replace(metal, lights=[gi.Environment((0.2, 0.3, 0.5)), gi.DistantLight((1, -2, -1), 2.0)])
-    for scene in (gi.scenes.build("cornell-spheres"), open_air):
+    box = gi.scenes.build("cornell-box")
+    shapes = [
+        shape if shape.emission else dataclasses.replace(shape, material=gi.Coated(shape.material.albedo, 0.1))
+        for shape in box.shapes
+    ]
+    varnished = dataclasses.replace(box, shapes=shapes, lights=[gi.PointLight((0.4, 0.3, 0.1), 0.5)])
+    for scene in (gi.scenes.build("cornell-spheres"), open_air, varnished):
         reference = gi.render(scene, gi.PathTracing(spp=256), size, device="cpu")
         for gather in (0, 4):
             method = gi.PhotonMap(photons=100_000, final_gather=gather, edge_rays=8)
@@ -253,11 +259,15 @@ def test_pictures_do_not_depend_on_threads_or_memory():
         np.testing.assert_array_equal(one.image, other.image)
 
 
-@pytest.mark.parametrize("name", ["path", "photon-map"])
+@pytest.mark.parametrize("name", ["path", "photon-map", "instant-radiosity"])
 def test_a_resumed_render_equals_one_run(tmp_path, monkeypatch, name):
     """Stopped by Ctrl-C, in the middle of a map, and gone on from the checkpoint: the same picture, bit for bit."""
     scene = caustic()
-    method = gi.PathTracing(spp=12) if name == "path" else gi.PhotonMap(**SMALL, spp=12, map_spp=5)
+    method = {
+        "path": gi.PathTracing(spp=12),
+        "photon-map": gi.PhotonMap(**SMALL, spp=12, map_spp=5),
+        "instant-radiosity": gi.InstantRadiosity(paths=16, spp=12, set_spp=5),
+    }[name]
     whole = gi.render(scene, method, (16, 16), device="cpu")
     path = tmp_path / "half.npz"
 

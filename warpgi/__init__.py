@@ -8,6 +8,7 @@ from warpgi.animation import Animation
 from warpgi.camera import Camera
 from warpgi.denoise import denoise
 from warpgi.device import Device
+from warpgi.filter_animation import filter_animation
 from warpgi.lights import DistantLight, Environment, PointLight, SpotLight
 from warpgi.load import load_scene
 from warpgi.materials import Coated, Conductor, Dielectric, Diffuse, Emissive, Mirror, Texture
@@ -15,19 +16,23 @@ from warpgi.methods import (
     METHODS,
     AmbientOcclusion,
     ATrous,
+    InstantRadiosity,
     IrradianceCache,
     IrradianceFilter,
     Kernel,
     LightField,
+    NearLight,
     PathTracing,
     PhotonMap,
     RandomParameterFilter,
     Sampler,
+    StatisticalFilter,
     TemporalLightField,
 )
 from warpgi.metrics import compare, flicker
 from warpgi.mitsuba_samples import sample_from_mitsuba
 from warpgi.mitsuba_scene import to_mitsuba
+from warpgi.modes import Modes
 from warpgi.progress import Progress
 from warpgi.reconstruct import reconstruct
 from warpgi.render import Interrupted, render, versions
@@ -51,12 +56,15 @@ __all__ = [
     "DistantLight",
     "Emissive",
     "Environment",
+    "InstantRadiosity",
     "Interrupted",
     "IrradianceCache",
     "IrradianceFilter",
     "Kernel",
     "LightField",
     "Mirror",
+    "Modes",
+    "NearLight",
     "PathTracing",
     "PhotonMap",
     "PointLight",
@@ -69,10 +77,12 @@ __all__ = [
     "Sequence",
     "Shape",
     "SpotLight",
+    "StatisticalFilter",
     "TemporalLightField",
     "Texture",
     "compare",
     "denoise",
+    "filter_animation",
     "flicker",
     "load_scene",
     "reconstruct",

@@ -19,6 +19,7 @@ from warpgi.image import check_output
 from warpgi.load import SUFFIXES
 from warpgi.methods import DENOISERS as DENOISING_METHODS
 from warpgi.methods import RECONSTRUCTIONS as RECONSTRUCTION_METHODS
+from warpgi.methods import SEQUENCE_METHODS
 from warpgi.progress import RAY_KINDS
 
 MISUSE = 2  # exit status for a caller's mistake
@@ -49,6 +50,8 @@ def _subcommands(methods: Mapping[str, type]) -> Any:
 METHOD_SETTINGS: Any = _subcommands(gi.METHODS)
 RECONSTRUCTIONS: Any = _subcommands(RECONSTRUCTION_METHODS)
 DENOISERS: Any = _subcommands(DENOISING_METHODS)
+SEQUENCE_SETTINGS: Any = _subcommands(gi.METHODS | SEQUENCE_METHODS)
+SEQUENCE_FILTERS: Any = _subcommands(SEQUENCE_METHODS)
 
 
 @dataclass(frozen=True)
@@ -97,7 +100,7 @@ class AnimateCommand:
 
     sequence: tyro.conf.Positional[str]
     """A built-in sequence, with parameters as in moving-light:frames=20."""
-    method: METHOD_SETTINGS = field(default_factory=gi.PathTracing)  # type: ignore[valid-type]
+    method: SEQUENCE_SETTINGS = field(default_factory=gi.PathTracing)  # type: ignore[valid-type]
     """How to render it; path tracing by default."""
     size: tuple[int, int] = (256, 256)
     """Width and height in pixels."""
@@ -134,11 +137,33 @@ class AnimateCommand:
             frames,
             self.vary_seed,
         )
-        stages = ", ".join(f"{stage} {seconds:.2f} s" for stage, seconds in animation.timings.items())
-        found = len(animation) - len(animation.rendered)
-        print(f"{sequence.name}, {len(animation.rendered)} frames rendered, {found} found: {stages}")
-        _warn_of(animation.counts)
-        print(f"wrote {animation.paths[0]} to {animation.paths[-1].name}")
+        _told(sequence.name, animation, "rendered")
+
+
+@dataclass(frozen=True)
+class FilterCommand:
+    """Filter the frames of a rendered sequence in time, whoever rendered them."""
+
+    frames: tyro.conf.Positional[str]
+    """The frames' files, such as folder/frame-{:04d}.exr, from number 0 or 1 on."""
+    method: SEQUENCE_FILTERS = field(default_factory=gi.StatisticalFilter)  # type: ignore[valid-type]
+    """The filter; its settings of noisy frames mean nothing here."""
+    out: str = "filtered/frame-{:04d}.exr"
+    """The filtered frames' files, with modes.npz, the basis functions, beside them."""
+    resume: bool = False
+    """Keep filtered frames that are whole and of these very noisy ones."""
+    device: str | None = None
+    """cpu, cuda:0, ...; a GPU if there is one."""
+    threads: int | None = None
+    """CPU threads; all by default."""
+    memory_limit: float = 3.0
+    """GiB that arrays may take; longer sequences are read several times."""
+
+    def run(self) -> None:
+        device = _device(self.device, self.threads, self.memory_limit)
+        noisy = gi.Animation.load(self.frames)
+        animation = gi.filter_animation(noisy, self.method, device, sys.stderr.isatty(), self.out, self.resume)
+        _told(self.frames, animation, "filtered")
 
 
 @dataclass(frozen=True)
@@ -234,6 +259,8 @@ class MethodsCommand:
 
     def run(self) -> None:
         _table(gi.METHODS)
+        print("of sequences:")
+        _table(SEQUENCE_METHODS)
 
 
 @dataclass(frozen=True)
@@ -255,6 +282,7 @@ class InfoCommand:
 COMMANDS = (
     Annotated[RenderCommand, tyro.conf.subcommand("render")]
     | Annotated[AnimateCommand, tyro.conf.subcommand("animate")]
+    | Annotated[FilterCommand, tyro.conf.subcommand("filter")]
     | Annotated[ReconstructCommand, tyro.conf.subcommand("reconstruct")]
     | Annotated[DenoiseCommand, tyro.conf.subcommand("denoise")]
     | Annotated[CompareCommand, tyro.conf.subcommand("compare")]
@@ -330,6 +358,19 @@ def _keep(picture: gi.Render, out: tuple[Path, ...], exposure: float) -> None:
     _warn_of(picture.counts)
     for path in out:
         print(f"wrote {path}")
+
+
+def _told(name: str, animation: gi.Animation, done: str) -> None:
+    stages = ", ".join(f"{stage} {seconds:.2f} s" for stage, seconds in animation.timings.items() if seconds >= 0.005)
+    found = len(animation) - len(animation.rendered)
+    print(f"{name}, {len(animation.rendered)} frames {done}, {found} found: {stages}")
+    if animation.modes is not None:
+        modes = animation.modes
+        mean = f"{modes.truncation.mean():.2f} in the mean over pixels"
+        spp = "" if modes.average_spp is None else f", {modes.average_spp:.3f} spp in the mean"
+        print(f"{modes.count} of {len(modes.eigenvalues)} modes (chosen: {modes.rule.value}), {mean}{spp}")
+    _warn_of(animation.counts)
+    print(f"wrote {animation.paths[0]} to {animation.paths[-1].name}")
 
 
 def _warn_of(counts: Mapping[str, int]) -> None:

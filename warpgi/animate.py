@@ -12,18 +12,22 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import warpgi
 from warpgi import checks
 from warpgi.animation import Animation
 from warpgi.device import Device, as_device
 from warpgi.device_scene import DeviceScene
 from warpgi.film import Film
+from warpgi.filter_animation import filter_frames
 from warpgi.fingerprint import fingerprint
-from warpgi.image import check_output
+from warpgi.frame_files import FrameFiles
 from warpgi.job import Job
-from warpgi.methods import Method, PathTracing
+from warpgi.methods import Method, PathTracing, StatisticalFilter
 from warpgi.progress import Progress, progress_bar
 from warpgi.render import check_method, render_scene
+from warpgi.resampling import trace_pixels
 from warpgi.result import Render
 from warpgi.scene import Scene
 from warpgi.sequence import Sequence
@@ -33,7 +37,7 @@ FORMAT = 1
 
 def render_animation(
     sequence: Sequence,
-    method: Method | None = None,
+    method: Method | StatisticalFilter | None = None,
     size: tuple[int, int] = (256, 256),
     seed: int = 0,
     device: str | Device | None = None,
@@ -51,6 +55,7 @@ def render_animation(
     Args:
         sequence: what to render.
         method: how, as in `render`; path tracing by default. One with `prepare_next` carries state from frame to frame.
+            `StatisticalFilter` renders noisy frames, which it keeps in a folder "noisy" beside `out`, and filters them.
         size: (width, height) in pixels.
         seed: which random numbers, 0 to 2^31 - 1.
         device: "cpu", "cuda:0", a `Device`, or None for a GPU if there is one.
@@ -81,31 +86,59 @@ def render_animation(
     size = checks.image_size(size)
     seed = checks.count("seed", seed, 0)
     numbers = checked_frames(sequence, frames)
-    check_method(sequence.scene(numbers[0]), method)
-    files = None if out is None else FrameFiles(out)
-    if resume and files is None:
+    filtered = method if isinstance(method, StatisticalFilter) else None
+    estimator: Any = method if filtered is None else filtered.noisy
+    if filtered is not None and not vary_seed:
+        raise ValueError("vary_seed is False, expected True: StatisticalFilter would take equal noise for light")
+    check_method(sequence.scene(numbers[0]), estimator)
+    if resume and out is None:
         raise ValueError("resume is True, expected False where out is None: there are no files to go on from")
-    renderer = FrameRenderer(sequence, method, size, seed, as_device(device), vary_seed)
+    pattern = None if out is None else noisy_pattern(out) if filtered else out
+    files = None if pattern is None else FrameFiles(pattern)
+    renderer = FrameRenderer(sequence, estimator, size, seed, as_device(device), vary_seed)
+    with progress_bar(progress) as report:
+        animation = _render_frames(renderer, numbers, files, resume, report)
+    if filtered is None:
+        return animation
+    result = filter_frames(animation, filtered, renderer.device, progress, out, resume, renderer.resample(filtered))
+    result.timings = dict(Counter(animation.timings) + Counter(result.timings))
+    return result
+
+
+def _render_frames(
+    renderer: FrameRenderer,
+    numbers: tuple[int, ...],
+    files: FrameFiles | None,
+    resume: bool,
+    report: Callable[[Progress], None] | None,
+) -> Animation:
     sources: list[Render | Path] = []
     rendered: list[int] = []
     timings: Counter[str] = Counter()
     counts: Counter[str] = Counter()
     started = time.perf_counter()
-    with progress_bar(progress) as report:
-        for done, number in enumerate(numbers, 1):
-            frame = renderer.open(number)
-            picture = files.find(frame) if files and resume else None
-            if picture is None:
-                picture = renderer.render(frame)
-                rendered.append(number)
-                timings.update(picture.timings)
-                if files:
-                    files.save(frame, picture)
-            counts.update(picture.counts)
-            sources.append(picture if files is None else files.path(number))
-            if report is not None:
-                report(Progress(done, len(numbers), "frames", time.perf_counter() - started, dict(counts)))
-    return Animation(sources, numbers, sequence.fps, dict(timings), dict(counts), tuple(rendered))
+    for done, number in enumerate(numbers, 1):
+        frame = renderer.open(number)
+        picture = files.find(number, frame.identity) if files and resume else None
+        if picture is None:
+            picture = renderer.render(frame)
+            rendered.append(number)
+            timings.update(picture.timings)
+            if files:
+                files.save(number, frame.identity, picture)
+        counts.update(picture.counts)
+        sources.append(picture if files is None else files.path(number))
+        if report is not None:
+            report(Progress(done, len(numbers), "frames", time.perf_counter() - started, dict(counts)))
+    return Animation(sources, numbers, renderer.sequence.fps, dict(timings), dict(counts), tuple(rendered))
+
+
+def noisy_pattern(out: str | os.PathLike[str]) -> Path:
+    """Where the noisy frames of filtered ones are kept: a folder beside them."""
+    if not isinstance(out, (str, os.PathLike)):
+        raise TypeError(f"out is {type(out).__name__}, expected a path such as folder/frame-{{:04d}}.exr")
+    path = Path(out)
+    return path.with_name("noisy") / path.name
 
 
 def frame_seed(seed: int, frame: int) -> int:
@@ -182,6 +215,19 @@ class FrameRenderer:
             self._state, self._next, self._history = state, frame.number + 1, frame.identity
         return picture
 
+    def resample(self, method: StatisticalFilter) -> Callable[[int, np.ndarray], np.ndarray] | None:
+        """What samples pixels of a frame anew for importance sampling; None: nothing does."""
+        if not method.high_spp:
+            return None
+        paths = PathTracing(spp=method.high_spp)
+
+        def resample(number: int, pixels: np.ndarray) -> np.ndarray:
+            # other random numbers than the noisy frame's
+            seed = frame_seed(frame_seed(self.seed, number), number)
+            return trace_pixels(self.sequence.scene(number), pixels, paths, self.size, seed, self.device)
+
+        return resample
+
     def _make(self, number: int) -> Frame:
         scene = self.sequence.scene(number)
         seed = frame_seed(self.seed, number) if self.vary_seed else self.seed
@@ -197,46 +243,3 @@ class FrameRenderer:
         film = Film(self.size, self.device, room)
         self._state = self.method.prepare_next(job, film, before=self._state)  # type: ignore[attr-defined]
         self._before, self._next, self._history = on_device, frame.number + 1, frame.identity
-
-
-class FrameFiles:
-    """The files of an animation's frames.
-
-    Args:
-        pattern: their path with a place for the number, such as "folder/frame-{:04d}.exr"; the folder is made.
-
-    Raises:
-        TypeError, ValueError: it is no such pattern.
-        OSError: the folder takes no file.
-    """
-
-    def __init__(self, pattern: str | os.PathLike[str]) -> None:
-        if not isinstance(pattern, (str, os.PathLike)):
-            raise TypeError(f"out is {type(pattern).__name__}, expected a path such as folder/frame-{{:04d}}.exr")
-        self.pattern = os.fspath(pattern)
-        try:
-            one, two = (Path(self.pattern.format(number)) for number in (0, 1))
-        except (IndexError, KeyError, ValueError):
-            one = two = Path()
-        if one == two or one.suffix.lower() != ".exr" or one.parent != two.parent:
-            raise ValueError(f"out is {self.pattern}, expected a path such as folder/frame-{{:04d}}.exr")
-        one.parent.mkdir(parents=True, exist_ok=True)
-        check_output(one)
-
-    def path(self, number: int) -> Path:
-        """The file of a frame."""
-        return Path(self.pattern.format(number))
-
-    def find(self, frame: Frame) -> Render | None:
-        """The picture of this very frame if its file is there and whole."""
-        try:
-            picture = Render.load(self.path(frame.number))
-        except (OSError, ValueError):
-            return None
-        return picture if picture.identity == frame.identity else None
-
-    def save(self, frame: Frame, picture: Render) -> None:
-        """Writes a frame's picture, without what differs from run to run."""
-        picture.identity = frame.identity
-        picture.timings = {}
-        picture.save(self.path(frame.number))

@@ -9,6 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from warpgi.frame_files import frame_path
+from warpgi.image import PathLike
+from warpgi.modes import Modes
 from warpgi.result import Render
 
 
@@ -38,6 +41,8 @@ class Animation:
     """Sums of the frames' counts."""
     rendered: tuple[int, ...] = ()
     """Numbers of the frames that were rendered and not found."""
+    modes: Modes | None = None
+    """Basis functions of the sequence, where it was filtered by these."""
 
     def __post_init__(self) -> None:
         if len(self.sources) != len(self.frames) or not self.sources:
@@ -52,6 +57,27 @@ class Animation:
 
     def __iter__(self) -> Iterator[Render]:
         return (self[index] for index in range(len(self)))
+
+    @classmethod
+    def load(cls, pattern: PathLike, fps: float = 24.0) -> Animation:
+        """The frames in files, of this or another renderer, from the first number on up to the first that is not there.
+
+        Args:
+            pattern: their path with a place for the number, such as "folder/frame-{:04d}.exr"; the first is 0 or 1.
+            fps: frames per second.
+
+        Raises:
+            TypeError, ValueError: it is no such pattern.
+            FileNotFoundError: there is no frame 0 and no frame 1.
+        """
+        path = frame_path(pattern)
+        first = next((number for number in (0, 1) if path(number).exists()), None)
+        if first is None:
+            raise FileNotFoundError(f"{path(0)} does not exist, expected the first frame")
+        last = first
+        while path(last).exists():
+            last += 1
+        return cls([path(number) for number in range(first, last)], tuple(range(first, last)), fps)
 
     @property
     def paths(self) -> tuple[Path, ...]:

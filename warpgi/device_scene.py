@@ -212,36 +212,39 @@ class DeviceScene:
         return record, float(np.mean(light.intensity)) * 2.0 * np.pi * (1.0 - (2.0 * inner + outer) / 3.0)
 
     def _shape_record(self, shape: Shape, light_pdf: float) -> kernels.ShapeRecord:
-        record = kernels.ShapeRecord()
-        material: Material = shape.material
-        record.kind = int(KINDS[type(material)])
-        record.texture = -1
-        record.ior = 1.0
-        if isinstance(material, Dielectric):
-            record.ior = material.ior
-        else:
-            colour = material.albedo if isinstance(material, (Diffuse, Coated)) else material.reflectance
-            if isinstance(colour, Texture):
-                record.albedo = wp.vec3(1.0)
-                record.texture = self._textures[id(colour)]
-            else:
-                record.albedo = wp.vec3(*colour)  # type: ignore[misc]
-        if isinstance(material, Conductor):
-            record.exponent = 1.0 / material.roughness
-            if material.eta is not None and material.k is not None:
-                record.eta = wp.vec3(*material.eta)  # type: ignore[misc]
-                record.k = wp.vec3(*material.k)  # type: ignore[misc]
-        if isinstance(material, Coated):
-            coat = fit_coat(material.roughness, material.ior)
-            record.exponent, record.ior = 1.0 / material.roughness, material.ior
-            record.eta, record.k = wp.vec3(*coat.coefficients[:3]), wp.vec3(*coat.coefficients[3:])
-            record.coat = wp.vec3(coat.excess, 1.0 / coat.transmitted, coat.internal)
+        record = material_record(shape.material)
+        if shape.texture is not None:
+            record.texture = self._textures[id(shape.texture)]
         if shape.emission is not None:
             record.emission = wp.vec3(*shape.emission.radiance)  # type: ignore[misc]
             record.two_sided = int(shape.emission.two_sided)
             record.light_pdf = light_pdf
         record.has_normals = int(shape.normals is not None)
         return record
+
+
+def material_record(material: Material) -> kernels.ShapeRecord:
+    """What a BSDF needs of a material; a texture's place is taken by white."""
+    record = kernels.ShapeRecord()
+    record.kind = int(KINDS[type(material)])
+    record.texture = -1
+    record.ior = 1.0
+    if isinstance(material, Dielectric):
+        record.ior = material.ior
+    else:
+        colour = material.albedo if isinstance(material, (Diffuse, Coated)) else material.reflectance
+        record.albedo = wp.vec3(1.0) if isinstance(colour, Texture) else wp.vec3(*colour)  # type: ignore[misc]
+    if isinstance(material, Conductor):
+        record.exponent = 1.0 / material.roughness
+        if material.eta is not None and material.k is not None:
+            record.eta = wp.vec3(*material.eta)  # type: ignore[misc]
+            record.k = wp.vec3(*material.k)  # type: ignore[misc]
+    if isinstance(material, Coated):
+        coat = fit_coat(material.roughness, material.ior)
+        record.exponent, record.ior = 1.0 / material.roughness, material.ior
+        record.eta, record.k = wp.vec3(*coat.coefficients[:3]), wp.vec3(*coat.coefficients[3:])
+        record.coat = wp.vec3(coat.excess, 1.0 / coat.transmitted, coat.internal)
+    return record
 
 
 def _light_records(count: int) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 from warpgi import checks
 from warpgi.camera import Camera
 from warpgi.lights import DistantLight, Environment, Light, PointLight, SpotLight
-from warpgi.materials import Colour, Conductor, Dielectric, Diffuse, Material, Texture
+from warpgi.materials import Coated, Colour, Conductor, Dielectric, Diffuse, Material, Texture
 from warpgi.mitsuba_plugins import SPOT, SURFACE, register
 from warpgi.scene import Scene, Shape
 
@@ -47,7 +47,8 @@ def to_mitsuba(
         exact: surfaces with shading normals, rough metal and spot lights are plugins written in Python
             (`warpgi.mitsuba_plugins`), which cost nothing in a vectorised variant and much in a scalar one. False takes
             Mitsuba's own, which are close: foliage comes out some per cent brighter as shading normals let light
-            through, metal is of the Beckmann distribution, a spot light's edge is linear in the angle.
+            through, metal is of the Beckmann distribution, a spot light's edge is linear in the angle. Coated
+            surfaces are roughplastic then, and have no exact counterpart.
 
     Returns:
         A new dictionary; change its "integrator" and "sensor" or add to it as you like.
@@ -87,9 +88,9 @@ def to_mitsuba(
 
 
 def needs_plugins(scene: Scene) -> bool:
-    """Whether anything in it is exact in Mitsuba by plugins of ours alone."""
+    """Whether anything in it is not exact in Mitsuba but for plugins of ours, if at all."""
     smooth = (s.normals is not None and s.emission is None for s in scene.shapes if not _is_glass(s))
-    metal = (isinstance(shape.material, Conductor) for shape in scene.shapes)
+    metal = (isinstance(shape.material, (Conductor, Coated)) for shape in scene.shapes)
     return any(smooth) or any(metal) or any(isinstance(light, SpotLight) for light in scene.lights)
 
 
@@ -177,6 +178,8 @@ class _Exporter:
             return {"type": "dielectric", "int_ior": material.ior, "ext_ior": 1.0}
         if isinstance(material, Conductor):
             return self._metal(material) if self.exact else {"type": "twosided", "bsdf": self._nearly_metal(material)}
+        if isinstance(material, Coated):
+            return {"type": "twosided", "bsdf": self._nearly_coated(material)}
         is_diffuse = isinstance(material, Diffuse)
         colour = material.albedo if isinstance(material, Diffuse) else material.reflectance
         if smooth and self.exact:
@@ -194,10 +197,15 @@ class _Exporter:
             result |= {"eta": self.mi.ScalarVector3f(metal.eta), "k": self.mi.ScalarVector3f(metal.k)}
         return result
 
+    def _nearly_coated(self, coated: Coated) -> dict[str, Any]:
+        if self.exact:
+            raise NoCounterpart("Coated is only nearly Mitsuba's roughplastic, expected exact=False")
+        result = {"type": "roughplastic", "nonlinear": True, "int_ior": coated.ior, "ext_ior": 1.0}
+        beckmann = {"distribution": "beckmann", "alpha": _beckmann(coated.roughness)}
+        return result | beckmann | {"diffuse_reflectance": self._texture(coated.albedo)}
+
     def _nearly_metal(self, metal: Conductor) -> dict[str, Any]:
-        # Beckmann's roughness for a Blinn exponent (Walter et al. 2007, sec. 5.2)
-        alpha = math.sqrt(2.0 / (1.0 / metal.roughness + 2.0))
-        result = {"type": "roughconductor", "distribution": "beckmann", "alpha": alpha}
+        result = {"type": "roughconductor", "distribution": "beckmann", "alpha": _beckmann(metal.roughness)}
         if metal.eta is not None:
             return result | {"eta": rgb(metal.eta), "k": rgb(metal.k)}
         # eta 1 and such a k reflect this much at normal incidence (Pharr, Jakob, Humphreys 2023, sec. 9.4)
@@ -217,6 +225,11 @@ class _Exporter:
     def _bitmap(self, pixels: np.ndarray) -> Any:
         bitmap = {"type": "bitmap", "bitmap": self.mi.Bitmap(pixels.astype(np.float32)), "raw": True}
         return self.mi.load_dict(bitmap | {"filter_type": "bilinear", "wrap_mode": "repeat"})
+
+
+def _beckmann(roughness: float) -> float:
+    """Beckmann's roughness for a Blinn exponent of 1 / roughness (Walter et al. 2007, sec. 5.2)."""
+    return math.sqrt(2.0 / (1.0 / roughness + 2.0))
 
 
 def _is_glass(shape: Shape) -> bool:

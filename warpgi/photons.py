@@ -17,6 +17,8 @@ from warpgi.splat_tree import SplatTree
 BATCH = 1 << 17
 SLOTS = 4
 FIELDS = {"position": wp.vec3, "normal": wp.vec3, "flux": wp.vec3, "kind": int}
+#: What those need who read photons as lights.
+SURFACE_FIELDS = {"face": int, "bary": wp.vec2, "incident": wp.vec3}
 PHOTON_BYTES = 3 * 12 + 4
 BATCH_BYTES = BATCH * (SLOTS * PHOTON_BYTES + 20)
 #: Device bytes of a photon in a tree: the lane of its block, nodes, order and sort keys.
@@ -58,16 +60,19 @@ class PhotonSource:
         scene: on the device.
         seed: which random numbers.
         sampler: INDEPENDENT or SOBOL.
+        sharpest: Blinn exponent up to which glossy lobes leave photons too, each with all that a light needs; 0: only
+            diffuse surfaces, for densities.
     """
 
-    def __init__(self, scene: DeviceScene, seed: int, sampler: int) -> None:
+    def __init__(self, scene: DeviceScene, seed: int, sampler: int, sharpest: float = 0.0) -> None:
         self.scene, self.device = scene, scene.device
+        self.fields = FIELDS | (SURFACE_FIELDS if sharpest > 0.0 else {})
         self.noise = NOISE_ULPS * max(scene.radius, 1e-30)
         self.has_caustics = any(not isinstance(shape.material, Diffuse) for shape in scene.scene.shapes)
         emission = kernels.Emission()
         # another stream than the camera's
         emission.seed, emission.sampler = -1 - seed, sampler
-        emission.radius = scene.radius
+        emission.radius, emission.sharpest = scene.radius, sharpest
         sky = float(np.mean(scene.struct.environment)) * 4.0 * np.pi**2 * scene.radius**2
         emission.environment = sky / max(sky + scene.power, 1e-30)
         self.dark = sky + scene.power <= 0.0
@@ -111,7 +116,7 @@ class PhotonSource:
         emission.map, emission.part, emission.caustics, emission.aim_cdf = number, 1.0 / paths, int(caustics), aim
         slots = 1 if caustics else SLOTS
         size = min(paths, BATCH)
-        room = _photons(device, size * slots)
+        room = _photons(device, size * slots, self.fields)
         tracks = kernels.Tracks()
         for name in ("stored", "rays", "dropped", "cell"):
             setattr(tracks, name, device.zeros(size, int))
@@ -133,29 +138,31 @@ class PhotonSource:
                     f"memory_limit is {device.memory_limit} bytes, expected more than {need} for the photons of"
                     f" {first + count} of {paths} paths"
                 )
-            part = _photons(device, found)
+            part = _photons(device, found, self.fields)
             device.launch(kernels.pack, count, [*inputs, room, ends], [part])
             parts.append((part, found))
             rays += int(tracks.rays.numpy()[:count].sum(dtype=np.int64))
             dropped += int(tracks.dropped.numpy()[:count].sum(dtype=np.int64))
             cells[first : first + count] = tracks.cell.numpy()[:count]
             stored[first : first + count] = tracks.stored.numpy()[:count]
-        photons = parts[0][0] if len(parts) == 1 else _joined(device, parts, total)
+        photons = parts[0][0] if len(parts) == 1 else _joined(device, parts, total, self.fields)
         return Shot(photons, total, paths, rays, dropped, cells, stored)
 
 
-def _photons(device: Device, count: int) -> kernels.Photons:
+def _photons(device: Device, count: int, fields: dict[str, type]) -> kernels.Photons:
     result = kernels.Photons()
-    for name, dtype in FIELDS.items():
+    for name, dtype in fields.items():
         setattr(result, name, device.zeros(count, dtype))
     return result
 
 
-def _joined(device: Device, parts: list[tuple[kernels.Photons, int]], total: int) -> kernels.Photons:
-    result = _photons(device, total)
+def _joined(
+    device: Device, parts: list[tuple[kernels.Photons, int]], total: int, fields: dict[str, type]
+) -> kernels.Photons:
+    result = _photons(device, total, fields)
     start = 0
     for part, count in parts:
-        for name in FIELDS:
+        for name in fields:
             wp.copy(getattr(result, name), getattr(part, name), start, 0, count)
         start += count
     return result

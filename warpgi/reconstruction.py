@@ -109,13 +109,9 @@ class Reconstruction:
         self._upload(splats, hits)
         is_primary = state.is_primary if hits is None else np.abs(hits.origin).max(axis=1) < NO_HIT
         self.primary = np.flatnonzero(is_primary).astype(np.int32)
-        self.tree = SplatTree(device, self._hits, self._hit_normals, self._radiance, splats, self.noise)
-        rays = kernels.Rays()
-        rays.origins, rays.hits, rays.order = self._origins, self._hits, self.tree.order
-        self.rays, self.preprocessing = rays, preprocessing
-        self.tree.size_by_neighbours(rays, preprocessing.neighbours, preprocessing.alpha)
+        self.preprocessing = preprocessing
         self.escaped = np.flatnonzero(state.is_escaped).astype(np.int32)
-        self._fit()
+        self._make_tree(splats)
         self.sky = make_sky(samples, self.escaped, device)
         self.counts = {name: count for name, count in state.counts.items() if name != "primary_missed"}
         self.counts |= {"splats": len(splats), "reconstruction_rays": 0}
@@ -195,7 +191,7 @@ class Reconstruction:
         self.tree.shrink(self.rays, self.preprocessing.margin, self.escaped, self.extent)
 
     def _send(self, hemispheres: Hemispheres, count: int, outputs: list[wp.array]) -> None:
-        inputs = [self.tree.struct, self.sky, hemispheres, self.seed, self.noise, *self._keep()]
+        inputs = [self.tree.struct, self.sky, hemispheres, self.seed, self.noise, *self._kept_parts()]
         self.device.launch(kernels.reconstruct_strata, count, inputs, outputs)
 
     def _upload(self, splats: np.ndarray, receivers: PrimaryHits | None) -> None:
@@ -218,6 +214,15 @@ class Reconstruction:
             self._receiver_origins = device.array(receivers.origin - centre, wp.vec3)
         self._receiver_normals = device.array(receivers.normal, wp.vec3)
         self._receiver_albedo = device.array(receivers.albedo, wp.vec3)
+
+    def _make_tree(self, splats: np.ndarray) -> None:
+        """Splats of the size that their neighbours and the input rays leave them."""
+        self.tree = SplatTree(self.device, self._hits, self._hit_normals, self._radiance, splats, self.noise)
+        rays = kernels.Rays()
+        rays.origins, rays.hits, rays.order = self._origins, self._hits, self.tree.order
+        self.rays = rays
+        self.tree.size_by_neighbours(rays, self.preprocessing.neighbours, self.preprocessing.alpha)
+        self._fit()
 
     def _make_receivers(
         self, sample: np.ndarray, origins: wp.array, normals: wp.array, per_pixel: int
@@ -244,12 +249,12 @@ class Reconstruction:
         self, receivers: kernels.Receivers, gathered: kernels.Gathered, size: int, first: int, count: int, each: int
     ) -> None:
         inputs = [self.tree.struct, self.sky, receivers, each, first, count, self.seed, self.noise, self.reach]
-        inputs += self._keep()
+        inputs += self._kept_parts()
         self.device.launch(kernels.reconstruct, size, inputs, [gathered])
         self.counts["reconstruction_rays"] += size * count
 
-    def _keep(self) -> list[float]:
-        """Squared parts of their radius that one splat and two keep where they are alone in the first surface."""
+    def _kept_parts(self) -> list[float]:
+        """Squared parts of their radius that one splat alone, and two, keep in the first surface."""
         lone = self.preprocessing.lone_radius
         # half the radius for one means two thirds for two
         return [lone**2, (1.0 - (1.0 - lone) * 2.0 / 3.0) ** 2]

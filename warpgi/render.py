@@ -20,7 +20,7 @@ from warpgi.device import Device, as_device
 from warpgi.device_scene import DeviceScene
 from warpgi.film import Film
 from warpgi.job import Job
-from warpgi.methods import METHODS, Method, PathTracing
+from warpgi.methods import METHODS, SEQUENCE_METHODS, Method, PathTracing
 from warpgi.metrics import count_fireflies
 from warpgi.passes import PASS_SECONDS, Passes
 from warpgi.progress import Progress, progress_bar
@@ -198,11 +198,11 @@ def render_scene(
     return result, on_device, state
 
 
-def provenance(method: Method, seed: int, device: Device) -> dict[str, Any]:
+def provenance(method: Any, seed: int, device: Device) -> dict[str, Any]:
     """Fields of a `Render` that say what made it."""
     return {
-        "method": next(name for name, kind in METHODS.items() if isinstance(method, kind)),
-        "settings": dataclasses.asdict(method),  # type: ignore[call-overload]
+        "method": next(name for name, kind in (METHODS | SEQUENCE_METHODS).items() if isinstance(method, kind)),
+        "settings": dataclasses.asdict(method),
         "seed": seed,
         "device": device.name,
         "versions": versions(),
@@ -231,7 +231,7 @@ def _check_end(method: Method, seconds: float | None, error: float | None, check
             raise ValueError(f"{name} is given, expected None: {type(method).__name__} keeps more than its film")
 
 
-def check_method(scene: Scene, method: Method) -> None:
+def check_method(scene: Scene, method: Any) -> None:
     """Refuses what is no scene or no method, and a scene that the method cannot render.
 
     Raises:
@@ -239,6 +239,8 @@ def check_method(scene: Scene, method: Method) -> None:
     """
     if not isinstance(scene, Scene):
         raise TypeError(f"scene is {type(scene).__name__}, expected Scene")
+    if isinstance(method, tuple(SEQUENCE_METHODS.values())):
+        raise TypeError(f"method is {type(method).__name__}, which is for a Sequence in render_animation")
     if not isinstance(method, tuple(METHODS.values())):
         names = ", ".join(kind.__name__ for kind in METHODS.values())
         raise TypeError(f"method is {type(method).__name__}, expected the settings of one: {names}")

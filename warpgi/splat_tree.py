@@ -21,6 +21,7 @@ class SplatTree:
         hits, normals, radiance: of all samples, vec3 arrays on the device.
         splats: which samples are splats, int array on the host.
         noise: rounding of the positions.
+        order: what `order` shall be; None: along a Hilbert curve.
 
     Attributes:
         struct: what kernels see.
@@ -35,12 +36,13 @@ class SplatTree:
         radiance: wp.array,
         splats: np.ndarray,
         noise: float,
+        order: wp.array | None = None,
     ) -> None:
         self.device = device
         self.noise = noise
         self.count = len(splats)
         self.block_count = max(1, -(-self.count // LANES))  # of an empty tree all lanes are unused
-        self.order = hilbert_order(device, hits, splats)
+        self.order = hilbert_order(device, hits, splats) if order is None else order
         self.levels, first = tree_levels(self.block_count)
         self.node_count = len(first)
         struct = SplatTreeStruct()

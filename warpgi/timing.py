@@ -23,4 +23,4 @@ class Timings(dict[str, float]):
         try:
             yield
         finally:
-            self[name] += time.perf_counter() - start
+            self[name] = self.get(name, 0.0) + time.perf_counter() - start

@@ -9,12 +9,14 @@ from warpgi.film import Film
 from warpgi.job import Job
 from warpgi.methods.a_trous import ATrous
 from warpgi.methods.ambient_occlusion import AmbientOcclusion
+from warpgi.methods.instant_radiosity import InstantRadiosity, NearLight
 from warpgi.methods.irradiance_cache import IrradianceCache
 from warpgi.methods.irradiance_filter import IrradianceFilter
 from warpgi.methods.light_field import LightField
 from warpgi.methods.path import PathTracing, Sampler
 from warpgi.methods.photon_map import Kernel, PhotonMap
 from warpgi.methods.random_parameter_filter import RandomParameterFilter
+from warpgi.methods.statistical_filter import StatisticalFilter
 from warpgi.methods.temporal_light_field import TemporalLightField
 
 
@@ -76,8 +78,12 @@ METHODS: dict[str, type] = {
     "irradiance-cache": IrradianceCache,
     "irradiance-filter": IrradianceFilter,
     "photon-map": PhotonMap,
+    "instant-radiosity": InstantRadiosity,
     "temporal-light-field": TemporalLightField,
 }
+
+#: Methods of whole sequences, which `render_animation` takes and `render` does not.
+SEQUENCE_METHODS: dict[str, type] = {"statistical-filter": StatisticalFilter}
 
 #: Those that make a picture of a sample buffer alone, and those that filter the layers of a finished one.
 RECONSTRUCTIONS = {name: kind for name, kind in METHODS.items() if hasattr(kind, "layers")}
@@ -87,17 +93,21 @@ __all__ = [
     "DENOISERS",
     "METHODS",
     "RECONSTRUCTIONS",
+    "SEQUENCE_METHODS",
     "ATrous",
     "AmbientOcclusion",
     "FrameMethod",
+    "InstantRadiosity",
     "IrradianceCache",
     "IrradianceFilter",
     "Kernel",
     "LightField",
     "Method",
+    "NearLight",
     "PathTracing",
     "PhotonMap",
     "RandomParameterFilter",
     "Sampler",
+    "StatisticalFilter",
     "TemporalLightField",
 ]

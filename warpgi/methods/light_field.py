@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -14,6 +14,7 @@ from warpgi.cached_reconstruction import CachedReconstruction
 from warpgi.device import Device
 from warpgi.device_scene import DeviceScene
 from warpgi.film import Film
+from warpgi.glossy_reconstruction import GlossyReconstruction
 from warpgi.irradiance import STRATA_BYTES
 from warpgi.job import Job
 from warpgi.kernels.light_field import add_reflected
@@ -48,8 +49,8 @@ AnyReconstruction = Reconstruction | CachedReconstruction | LensReconstruction
 class LightField:
     """Indirect light reconstructed from a few path-traced samples per pixel (Lehtinen et al. 2012).
 
-    Reconstructs what diffuse surfaces reflect; what others do keeps its path-traced light. `gi.reconstruct` uses it on
-    a sample buffer alone, where the fields that say how samples are traced mean nothing.
+    Reconstructs what diffuse and glossy surfaces reflect; mirrors and glass keep their path-traced light.
+    `gi.reconstruct` uses it on a sample buffer alone, where the fields that say how samples are traced mean nothing.
 
     Raises:
         TypeError, ValueError: a setting is out of range.
@@ -69,6 +70,9 @@ class LightField:
     """Part of its radius that a splat keeps where it alone is the first surface on a ray and others lie behind, in
     (0, 1]; two keep a third less of the difference to 1. The paper takes 0.5 against too much occlusion; measured
     in foliage it lets too much light through, and 1 is nearer to the truth and faster."""
+    bandwidth: bool = True
+    """Read the light of glossy surfaces that secondary rays met from samples of like direction; False takes it for the
+    same in all directions, as diffuse surfaces send it."""
     recursive: int = 0
     """Times that the samples' own light is reconstructed first; cures artefacts of noisy samples in corners."""
     recursive_rays: int = 16
@@ -188,6 +192,7 @@ class LightField:
             self.roulette_depth or NEVER,
             self.sampler,
             with_hit_light=self.recursive > 0,
+            with_gloss=job.scene.scene.is_glossy and not self.photons and not self.cache,
         )
         caustics = light_by_photons(job, self.photons, samples, hits) if self.photons else None
         state = self.reconstruction(samples, job.device, job.seed, hits, job.scene)
@@ -206,19 +211,17 @@ class LightField:
         """Splats made of a sample buffer, ready for `gather`."""
         if self.primary_rays:
             return LensReconstruction(samples, device, self.preprocessing, seed)
-        make: Callable[..., Reconstruction] = Reconstruction
+        bandwidth = self.bandwidth and samples.bandwidth is not None and not self.cache
+        make: Any = Reconstruction
         if self.cache and self.scene_rays and scene is not None:
             make = partial(TracedReconstruction, scene)
-        splats = make(
-            samples,
-            device,
-            self.preprocessing,
-            seed,
-            hits,
-            recursions=self.recursive,
-            recursive_rays=self.recursive_rays,
-        )
-        return CachedReconstruction(splats, hits, self.caching, self.rays) if self.cache else splats
+        elif samples.material is not None or bandwidth:
+            make = partial(GlossyReconstruction, bandwidth=bandwidth)
+        how = {"recursions": self.recursive, "recursive_rays": self.recursive_rays}
+        if self.cache and samples.material is not None:
+            raise ValueError("samples hold glossy surfaces, expected only diffuse ones for cache")
+        state: Reconstruction = make(samples, device, self.preprocessing, seed, hits, **how)
+        return CachedReconstruction(state, hits, self.caching, self.rays) if self.cache else state
 
     def estimate(self, job: Job, state: AnyReconstruction, film: Film, first: int, count: int) -> None:
         """Sends `count` reconstruction rays from every primary hit."""

@@ -1,0 +1,204 @@
+"""Instant radiosity (Keller 1997): indirect light from virtual point lights, progressive on request."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+import warp as wp
+
+from warpgi import checks
+from warpgi.film import Film
+from warpgi.job import Job
+from warpgi.kernels import instant_radiosity as kernels
+from warpgi.kernels import photons as photon_kernels
+from warpgi.kernels import rng
+from warpgi.kernels import vpls as vpl_kernels
+from warpgi.materials import Coated, Conductor, Dielectric, Mirror
+from warpgi.methods.path import Sampler
+from warpgi.photons import BATCH_BYTES, PHOTON_BYTES, PhotonSource
+from warpgi.vpls import VPL_BYTES, make_vpls
+
+# Lights that a path leaves behind, for a guess at memory before any is traced.
+LIGHTS_PER_PATH = 4
+
+
+class NearLight(Enum):
+    """What becomes of light from virtual lights that are near, where 1 / distance^2 has no bound."""
+
+    UNBOUNDED = "unbounded"
+    """Nothing: right in the mean over many sets of lights, with spikes in each."""
+    CLAMPED = "clamped"
+    """The geometry term is cut off at 1 / near_distance^2: no spikes, dark corners."""
+    COMPENSATED = "compensated"
+    """The same, and a ray from each camera hit brings back what is cut off (Kollig, Keller 2004)."""
+    SPHERICAL = "spherical"
+    """Lights are spheres of radius near_distance (Hasan et al. 2009): no spikes, light near corners is blurred."""
+
+
+NEAR = {
+    NearLight.UNBOUNDED: vpl_kernels.UNBOUNDED,
+    NearLight.CLAMPED: vpl_kernels.CLAMPED,
+    NearLight.COMPENSATED: vpl_kernels.COMPENSATED,
+    NearLight.SPHERICAL: vpl_kernels.SPHERICAL,
+}
+
+
+# `near_distance` over the radius of a path's share of the surface. Clamped lights and spheres lose light as it grows,
+# three times as much from 0.5 to 1; compensation pays with some rays more, for half the error from 1 to 2.
+NEAR_SHARE = {NearLight.UNBOUNDED: 1.0, NearLight.CLAMPED: 1.0, NearLight.COMPENSATED: 2.0, NearLight.SPHERICAL: 0.5}
+
+
+@dataclass(frozen=True, kw_only=True)
+class InstantRadiosity:
+    """Instant radiosity (Keller 1997): photons of a few light paths light the picture as virtual point lights.
+
+    Direct light is sampled as in every method, mirrors and glass are followed from the camera, and all other indirect
+    light comes from virtual lights on diffuse surfaces and rough gloss, joined by shadow rays with all that they light,
+    BSDFs at both ends. Caustics, and what smooth gloss reflects, come from rays. All pixels share the lights: errors
+    are no noise, but shadows and spots. With `set_spp` below `spp` it is progressive: one set of lights after the
+    other, and the picture converges to the path tracer's.
+
+    Raises:
+        TypeError, ValueError: a setting is out of range.
+    """
+
+    paths: int = 64
+    """Paths from the lights for a set of virtual lights; each leaves one at every surface that it meets."""
+    spp: int = 4
+    """Camera paths per pixel."""
+    set_spp: int | None = None
+    """Camera paths per pixel that share a set of lights before a new one is made; None: all."""
+    near_light: NearLight = NearLight.COMPENSATED
+    """How spikes near virtual lights are kept away."""
+    near_distance: float | None = None
+    """Distance [scene units] at which two surfaces that face each other reach the bound of the geometry term, or the
+    radius of spherical lights, above 0; None: in proportion to the disc that is one path's share of the scene's
+    surface. More takes more light away from the virtual lights."""
+    min_roughness: float = 0.05
+    """Rough metal and coats of this roughness or more are lit by virtual lights and become some; smoother ones are
+    followed by rays, in (0, 1]."""
+    light_samples: int = 2
+    """Shadow rays to lights from each camera path's first surface."""
+    sampler: Sampler = Sampler.SOBOL
+    """Where random numbers come from."""
+
+    def __post_init__(self) -> None:
+        for name in ("paths", "spp", "light_samples"):
+            checks.count(name, getattr(self, name))
+        if self.set_spp is not None:
+            checks.count("set_spp", self.set_spp)
+        if not isinstance(self.near_light, NearLight):
+            raise TypeError(f"near_light is {self.near_light!r}, expected a NearLight")
+        if self.near_distance is not None:
+            checks.number("near_distance", self.near_distance, 0.0, open_lower=True)
+        checks.number("min_roughness", self.min_roughness, 0.0, 1.0, open_lower=True)
+        if not isinstance(self.sampler, Sampler):
+            raise TypeError(f"sampler is {self.sampler!r}, expected a Sampler")
+
+    @property
+    def keeps_all_in_film(self) -> bool:
+        """Whether the film is all that a later pass needs of earlier ones; lights can be made again."""
+        return True
+
+    @property
+    def needs_light(self) -> bool:
+        """Whether the picture of a scene without light is black."""
+        return True
+
+    @property
+    def kernels(self) -> tuple[wp.Kernel, ...]:
+        """What it launches: a kernel of each module."""
+        return (kernels.light_pixels, photon_kernels.shoot, vpl_kernels.light_up)
+
+    def passes(self) -> tuple[int, str]:
+        """Samples per pixel, the unit of its passes."""
+        return self.spp, "spp"
+
+    def device_bytes(self, size: tuple[int, int]) -> int:
+        """Device memory it takes beside scene and film, as far as it can be known."""
+        return BATCH_BYTES + LIGHTS_PER_PATH * self.paths * (PHOTON_BYTES + VPL_BYTES)
+
+    def prepare(self, job: Job, film: Film) -> Lighting:
+        """The set of lights that comes next."""
+        lighting = Lighting(self, job)
+        if film.spp() < self.spp:
+            lighting.use(film.spp() // (self.set_spp or self.spp))
+        return lighting
+
+    def estimate(self, job: Job, state: Lighting, film: Film, first: int, count: int) -> None:
+        """Adds samples `first` to `first + count - 1` of every pixel, each by its set of lights."""
+        each = self.set_spp or self.spp
+        while count > 0:
+            state.use(first // each)
+            some = min(count, each - first % each)
+            for band in film.bands:
+                inputs = [job.scene.struct, job.camera, state.vpls, state.joining, state.view, first, some]
+                job.device.launch(kernels.light_pixels, len(band), inputs, [film.load(band)])
+            first, count = first + some, count - some
+
+    def finish(self, job: Job, state: Lighting, film: Film) -> dict[str, np.ndarray]:
+        """Nothing: every pass left a finished picture in the film."""
+        return {}
+
+    def counts(self, state: Lighting) -> dict[str, int]:
+        """Sets of lights so far and what they were made of."""
+        return state.counts
+
+
+class Lighting:
+    """The virtual lights of a picture, set by set.
+
+    Attributes:
+        vpls, joining, view: what kernels see.
+        counts: of all sets so far.
+    """
+
+    def __init__(self, settings: InstantRadiosity, job: Job) -> None:
+        self.settings, self.job = settings, job
+        sampler = int(rng.SOBOL if settings.sampler is Sampler.SOBOL else rng.INDEPENDENT)
+        sharpest = 1.0 / settings.min_roughness
+        self.source = PhotonSource(job.scene, job.seed, sampler, sharpest)
+        joining = vpl_kernels.Joining()
+        joining.near, joining.sharpest = int(NEAR[settings.near_light]), sharpest
+        joining.radius = self.near_distance()
+        if settings.near_light in (NearLight.CLAMPED, NearLight.COMPENSATED):
+            joining.bound = min(joining.radius**-2, 1e30)
+        self.joining = joining
+        view = kernels.View()
+        view.seed, view.sampler, view.light_samples = job.seed, sampler, settings.light_samples
+        view.interleave, view.width = 1, job.size[0]
+        sharp = any(
+            isinstance(m, (Mirror, Dielectric))
+            or (isinstance(m, (Conductor, Coated)) and m.roughness < settings.min_roughness)
+            for m in (shape.material for shape in job.scene.scene.shapes)
+        )
+        compensated = settings.near_light is NearLight.COMPENSATED
+        view.goes_on = int(job.scene.struct.visible_light != 0 or sharp or compensated)
+        self.view = view
+        self.vpls = vpl_kernels.Vpls()
+        self.number = -1
+        self.counts = dict.fromkeys(("vpl_sets", "vpl_paths", "vpls", "photon_rays", "nonfinite_photons"), 0)
+
+    def near_distance(self) -> float:
+        """Where clamping begins, or the radius of spherical lights."""
+        if self.settings.near_distance is not None:
+            return self.settings.near_distance
+        area = sum(float(shape.areas().sum()) for shape in self.job.scene.scene.shapes)
+        return NEAR_SHARE[self.settings.near_light] * math.sqrt(area / (math.pi * self.settings.paths))
+
+    def use(self, number: int) -> None:
+        """Makes set `number` of the lights unless it is the present one."""
+        if number == self.number:
+            return
+        self.number = number
+        shot = self.source.shoot(self.settings.paths, number)
+        self.vpls = make_vpls(self.job.scene, shot.photons, shot.count, self.joining.sharpest)
+        self._shot = shot  # structs do not keep their arrays alive
+        self.counts["vpl_sets"] += 1
+        self.counts["vpl_paths"] += shot.paths
+        self.counts["vpls"] += shot.count
+        self.counts["photon_rays"] += shot.rays
+        self.counts["nonfinite_photons"] += shot.dropped
