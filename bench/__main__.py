@@ -93,6 +93,23 @@ def figures_command(
     figures.side_by_side(out, scene, methods, size, spp, rays, reference_spp, exposure, device)
 
 
+def cache_command(
+    out: Path = Path("cache.png"),
+    size: tuple[int, int] = (256, 256),
+    reference_spp: int = 1024,
+    device: str | None = None,
+) -> None:
+    """Irradiance caches beside their reference, and where their records are.
+
+    Args:
+        out: the PNG.
+        size: width and height in pixels of each part.
+        reference_spp: paths per pixel of the reference.
+        device: cpu, cuda:0, ...; a GPU if there is one.
+    """
+    figures.cache(out, size, reference_spp, device)
+
+
 def lens_command(
     out: Path,
     size: tuple[int, int] = (640, 360),
@@ -175,6 +192,7 @@ def main(arguments: list[str] | None = None) -> int:
     app.command(rays_command, name="rays")
     app.command(figures_command, name="figures")
     app.command(scaling_command, name="scaling")
+    app.command(cache_command, name="cache")
     app.command(lens_command, name="lens")
     app.command(chart_command, name="chart")
     app.command(stability_command, name="stability")

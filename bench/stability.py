@@ -12,7 +12,7 @@ from rich.table import Table
 
 import warpgi as gi
 from bench.chart_page import PAGE, RESULTS, STABILITY, write_page
-from bench.failures import ambient_occlusion, instant_radiosity, light_field, path, photon_map
+from bench.failures import ambient_occlusion, instant_radiosity, irradiance_cache, light_field, path, photon_map
 from bench.failures.failure import Failure
 from bench.report import circumstances, finite, progress
 from warpgi.image import atomic_write
@@ -23,6 +23,7 @@ FAILURES: tuple[Failure, ...] = (
     *light_field.ROWS,
     *ambient_occlusion.ROWS,
     *photon_map.ROWS,
+    *irradiance_cache.ROWS,
     *instant_radiosity.ROWS,
 )
 
