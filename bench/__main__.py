@@ -7,7 +7,7 @@ from pathlib import Path
 
 import tyro
 
-from bench import chart, figures, rays, reconstruction, stability
+from bench import animations, cache_figure, chart, figures, rays, reconstruction, stability
 
 BROKEN = 1  # exit status for a method that is worse than its bound
 MISUSE = 2  # exit status for a caller's mistake
@@ -67,68 +67,72 @@ def scaling_command(
 
 
 def figures_command(
-    out: Path,
-    scene: str = "cornell-box",
-    methods: tuple[str, ...] = ("light-field",),
-    size: tuple[int, int] = (256, 256),
-    spp: int = 8,
-    rays: int = 256,
-    reference_spp: int = 1024,
-    exposure: float = 0.0,
+    figure: tuple[str, ...] = (),
+    size: tuple[int, int] | None = None,
+    quick: bool = False,
+    out: Path = Path("out/figures"),
+    picture: Path | None = None,
+    fresh: bool = False,
     device: str | None = None,
 ) -> None:
-    """Picture of the indirect light of a scene: input, methods and reference side by side.
+    """Make the figures of Lehtinen et al. 2012 on scenes of ours: pictures, differences times two, and numbers.
+
+    Ctrl-C keeps what is finished; the same command does what is missing.
 
     Args:
-        out: PNG to write.
-        scene: Built-in scene, or mitsuba-cornell-box: Mitsuba's own, which Mitsuba samples and path-traces.
-        methods: Methods that work on samples: light-field, a-trous, ...
-        size: Width and height of each panel in pixels.
-        spp: Input samples per pixel.
-        rays: Reconstruction rays per pixel.
-        reference_spp: Paths per pixel of the reference.
-        exposure: Stops by which the picture is brightened.
+        figure: Numbers of the paper, 1, 4 and 7 to 13, or mitsuba: Mitsuba's own Cornell box; all numbers by default.
+        size: Width and height of each panel in pixels, instead of the figure's own.
+        quick: A sixteenth of the pixels, 32 rays, and references of 64 spp.
+        out: Folder for a PNG, JSON and NPZ (the panels) of each figure.
+        picture: Where the PNG of a single figure goes too.
+        fresh: Make finished figures anew.
         device: cpu, cuda, cuda:0, ...; a GPU if there is one.
     """
-    figures.side_by_side(out, scene, methods, size, spp, rays, reference_spp, exposure, device)
+    figures.run(figure, out, size, quick, device, picture, fresh)
 
 
 def cache_command(
-    out: Path = Path("cache.png"),
+    out: Path,
     size: tuple[int, int] = (256, 256),
     reference_spp: int = 1024,
     device: str | None = None,
 ) -> None:
-    """Irradiance caches beside their reference, and where their records are.
-
-    Args:
-        out: the PNG.
-        size: width and height in pixels of each part.
-        reference_spp: paths per pixel of the reference.
-        device: cpu, cuda:0, ...; a GPU if there is one.
-    """
-    figures.cache(out, size, reference_spp, device)
-
-
-def lens_command(
-    out: Path,
-    size: tuple[int, int] = (640, 360),
-    rays: int = 192,
-    reference_spp: int = 1024,
-    device: str | None = None,
-    json: Path | None = None,
-) -> None:
-    """Picture of defocus and motion: 1 spp of butterflies, both methods that reconstruct from it, and the reference.
+    """Picture of irradiance caches beside their reference, and of where their records are.
 
     Args:
         out: PNG to write.
-        size: Width and height of each panel in pixels.
-        rays: Reconstruction rays per pixel.
+        size: Width and height in pixels of each part.
         reference_spp: Paths per pixel of the reference.
         device: cpu, cuda, cuda:0, ...; a GPU if there is one.
-        json: File for the numbers.
     """
-    figures.lens(out, size, rays, reference_spp, device, json)
+    cache_figure.draw(out, size, reference_spp, device)
+
+
+def animation_command(
+    scene: str = "moving-light",
+    size: tuple[int, int] = (64, 64),
+    spp: int = 32,
+    frames: int | None = None,
+    pairs: int = 5,
+    reference_spp: int = 4096,
+    device: str | None = None,
+    json: Path | None = None,
+    picture: Path | None = None,
+) -> None:
+    """Judge the statistical filter on a sequence: seconds, error and flicker beside 512 samples, a box filter and OIDN.
+
+    Args:
+        scene: Built-in sequence.
+        size: Width and height in pixels.
+        spp: Paths per pixel of the noisy frames.
+        frames: How many frames; as many as the sequence has by default.
+        pairs: Pairs of neighbouring frames at which errors are measured.
+        reference_spp: Paths per pixel of these frames' references.
+        device: cpu, cuda, cuda:0, ...; a GPU if there is one.
+        json: File for the numbers.
+        picture: PNG of basis functions, truncation map and percentVar.
+    """
+    animations.run(animations.Contest(scene, size, spp, frames, pairs, reference_spp, device), json, picture)
 
 
 def chart_command(
@@ -193,7 +197,7 @@ def main(arguments: list[str] | None = None) -> int:
     app.command(figures_command, name="figures")
     app.command(scaling_command, name="scaling")
     app.command(cache_command, name="cache")
-    app.command(lens_command, name="lens")
+    app.command(animation_command, name="animation")
     app.command(chart_command, name="chart")
     app.command(stability_command, name="stability")
     try:

@@ -12,7 +12,15 @@ from rich.table import Table
 
 import warpgi as gi
 from bench.chart_page import PAGE, RESULTS, STABILITY, write_page
-from bench.failures import ambient_occlusion, instant_radiosity, irradiance_cache, light_field, path, photon_map
+from bench.failures import (
+    ambient_occlusion,
+    instant_radiosity,
+    irradiance_cache,
+    light_field,
+    path,
+    photon_map,
+    statistical_filter,
+)
 from bench.failures.failure import Failure
 from bench.report import circumstances, finite, progress
 from warpgi.image import atomic_write
@@ -25,6 +33,7 @@ FAILURES: tuple[Failure, ...] = (
     *photon_map.ROWS,
     *irradiance_cache.ROWS,
     *instant_radiosity.ROWS,
+    *statistical_filter.ROWS,
 )
 
 PASS, FAIL, OPEN = "pass", "fail", "open"

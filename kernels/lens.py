@@ -19,6 +19,7 @@ class Lens:
 
     width: int  # of the picture
     radius: float  # 0: a pinhole
+    stop: float  # part of it that rays of the picture take, 0: its centre alone
     corner: wp.vec3  # of the picture's first pixel, on the focal plane
     right: wp.vec3  # to the next pixel
     down: wp.vec3
@@ -54,7 +55,7 @@ def lens_ray(lens: Lens, seed: int, pixel: int, index: int):
     r.y = float(pixel // lens.width) + film[1]
     r.o = wp.vec3(0.0)
     if lens.radius > 0.0:
-        r.uv = square_to_disc(sample_2d(sampler, 4))
+        r.uv = square_to_disc(sample_2d(sampler, 4)) * lens.stop
         r.o = wp.vec3(lens.radius * r.uv[0], lens.radius * r.uv[1], 0.0)
     if lens.moving != 0:
         r.time = sample_2d(sampler, 5)[0]

@@ -33,6 +33,7 @@ class PathSettings:
     roulette_depth: int  # segments after which roulette may end a path
     sampler: int  # INDEPENDENT or SOBOL
     seed: int
+    layers: int  # 1: tell bandwidth and base of what is met first
 
 
 @wp.func
@@ -91,7 +92,8 @@ def trace_path(
         wo = -d
         if depth == 1:
             path = add_features(path, s, wo, hit.t)
-            path.bandwidth = bandwidth(shape)
+            if settings.layers != 0:
+                path.bandwidth = bandwidth(shape)
             if scene.moving != 0:
                 path.motion = motion_at(scene, hit)
         elif depth == 2:
@@ -116,7 +118,7 @@ def trace_path(
             light = direct_light(scene, shape, s, n, wo, sample_2d(sampler, pair), extra[0], 1.0)
             path.shadow_rays = path.shadow_rays + light.shadow_rays
             path = add_light(path, depth + 1, wp.cw_mul(throughput, light.radiance))
-            if depth == 1:
+            if depth == 1 and settings.layers != 0:
                 before = light.radiance
                 path.base = wp.cw_mul(before, base_share(shape, s.albedo, n, wo, light.wi))
         if last and scene.visible_light == 0:
@@ -128,7 +130,7 @@ def trace_path(
             break
         if b.transmitted == 0 and not reflects(s, wo, b.wi):
             break  # a shading normal sent it through the surface
-        if depth == 1:
+        if depth == 1 and settings.layers != 0:
             share = base_share(shape, s.albedo, n, wo, b.wi)
         throughput = wp.cw_mul(throughput, b.weight)
         eta_scale = eta_scale * b.eta * b.eta
@@ -144,7 +146,8 @@ def trace_path(
         d = b.wi
         depth = depth + 1
         path.has_ray = 1
-    path.base = path.base + wp.cw_mul(share, path.direct + path.indirect - before)
+    if settings.layers != 0:
+        path.base = path.base + wp.cw_mul(share, path.direct + path.indirect - before)
     return path
 
 

@@ -48,6 +48,18 @@ LIGHT_CELLS = wp.constant(8)
 
 
 @wp.struct
+class Start:
+    """Where a path leaves its light, where that is not drawn at random."""
+
+    light: int  # of the scene's records, -1: the environment
+    weight: float  # share of all light, as if lights were picked by power
+    u: wp.vec2  # point of a lamp's triangle; direction of the environment's light
+    aim: wp.vec2
+    side: float  # of a lamp that emits on both, 1 or -1
+    key: int  # stands for the path's number in what is drawn
+
+
+@wp.struct
 class Emission:
     """How photons leave the lights."""
 
@@ -60,6 +72,7 @@ class Emission:
     caustics: int  # 1: only what reaches a diffuse surface over others; a path ends there
     sharpest: float  # exponent up to which glossy lobes leave photons too, 0: none do
     aim_cdf: wp.array[float]  # running sum over cells of their probability; empty: all alike
+    starts: wp.array[Start]  # of each path; empty: they are drawn
 
 
 @wp.struct
@@ -114,7 +127,7 @@ def parallel_beam(d: wp.vec3, u: wp.vec2, radius: float):
 
 
 @wp.func
-def emit(scene: Scene, emission: Emission, sampler: Sampler):
+def emit(scene: Scene, emission: Emission, path: int, sampler: Sampler):
     """A ray of light; its flux is that of the light over the density with which it was chosen.
 
     Cells cut the space of `choice` (which light) and `aim`: what decides most about where light goes, the direction of
@@ -143,16 +156,26 @@ def emit(scene: Scene, emission: Emission, sampler: Sampler):
         z = wp.min(int(choice * float(LIGHT_CELLS)), LIGHT_CELLS - 1)
         cell = (z * AIM_CELLS + y) * AIM_CELLS + x
     u = sample_2d(sampler, 1)
+    from_environment = choice < emission.environment
+    choice = wp.min((choice - emission.environment) / wp.max(1.0 - emission.environment, 1.0e-30), 0.99999994)
+    index = int(0)
+    if emission.starts.shape[0] > 0:
+        start = emission.starts[path]
+        weight = start.weight
+        u = start.u
+        aim = start.aim
+        index = start.light
+        from_environment = index < 0
+    elif not from_environment:
+        index = pick_light(scene, choice)
     beam = Beam()
-    if choice < emission.environment:
+    if from_environment:
         beam = parallel_beam(square_to_sphere(u), aim, emission.radius)
         area = PI * emission.radius * emission.radius
         beam.flux = scene.environment * (4.0 * PI * area * weight / emission.environment)
         beam.cell = cell
         return beam
     weight = weight / (1.0 - emission.environment)
-    choice = wp.min((choice - emission.environment) / (1.0 - emission.environment), 0.99999994)
-    index = pick_light(scene, choice)
     light = scene.lights[index]
     if light.face >= 0:
         a = scene.points[scene.indices[3 * light.face]]
@@ -164,7 +187,10 @@ def emit(scene: Scene, emission: Emission, sampler: Sampler):
         sides = float(1.0)
         if shape.two_sided != 0:
             sides = 2.0
-            if sample_2d(sampler, 3)[0] < 0.5:
+            turned = sample_2d(sampler, 3)[0] < 0.5
+            if emission.starts.shape[0] > 0:
+                turned = emission.starts[path].side < 0.0
+            if turned:
                 n = -n
         beam.o = a * bary[0] + b * bary[1] + c * bary[2] + n * ray_offset(a, b, c)
         beam.d = to_world(make_frame(n), square_to_cosine_hemisphere(aim))
@@ -217,6 +243,7 @@ class Track:
     rays: int
     dropped: int  # photons that were not finite
     cell: int  # where its light was aimed
+    first: Hit  # what it met first
 
 
 @wp.func
@@ -226,9 +253,13 @@ def trace_photons(scene: Scene, emission: Emission, path: int, photons: Photons,
     Roulette keeps the largest channel of the flux, so that photons stay about equal. Shading normals weigh the flux by
     the cosines that a path from the camera would have there (Veach 1997, eq. 5.19).
     """
-    sampler = make_sampler(emission.seed, emission.map, path, emission.sampler)
-    beam = emit(scene, emission, sampler)
+    key = int(path)
+    if emission.starts.shape[0] > 0:
+        key = emission.starts[path].key
+    sampler = make_sampler(emission.seed, emission.map, key, emission.sampler)
+    beam = emit(scene, emission, path, sampler)
     track = Track()
+    track.first.face = -1
     track.cell = beam.cell
     o = beam.o
     d = beam.d
@@ -238,6 +269,8 @@ def trace_photons(scene: Scene, emission: Emission, path: int, photons: Photons,
     while wp.max(flux) > 0.0:
         hit = closest_hit(scene, o, d)
         track.rays = track.rays + 1
+        if depth == 0:
+            track.first = hit
         if hit.face < 0:
             break
         shape = scene.shapes[scene.face_shapes[hit.face]]
@@ -323,6 +356,9 @@ class Tracks:
     rays: wp.array[int]
     dropped: wp.array[int]
     cell: wp.array[int]
+    # empty where nobody asked
+    face: wp.array[int]  # that it met first, -1: none
+    bary: wp.array[wp.vec2]
 
 
 @wp.kernel
@@ -334,6 +370,9 @@ def shoot(offset: int, scene: Scene, emission: Emission, first_path: int, slots:
     tracks.rays[i] = track.rays
     tracks.dropped[i] = track.dropped
     tracks.cell[i] = track.cell
+    if tracks.face.shape[0] > 0:
+        tracks.face[i] = track.first.face
+        tracks.bary[i] = wp.vec2(track.first.u, track.first.v)
 
 
 @wp.kernel

@@ -155,9 +155,15 @@ done:
 def walk(tree: TriangleTree, o: wp.vec3, d: wp.vec3, t_max: float, any_hit: int) -> wp.vec4: ...
 
 
-WALK_MOVING = WALK.replace(STILL_NODE, MOVING.format(name="node", index="current", count=48)).replace(
+_IN_MOTION = WALK.replace(STILL_NODE, MOVING.format(name="node", index="current", count=48)).replace(
     STILL_BLOCK, MOVING.format(name="block", index="block", count=72)
 )
+# Kept out of line: where all is still, its code must not take room and registers in the loops about the other walk.
+WALK_MOVING = f"""const auto moving = [&]() __attribute__((noinline)) -> wp::vec4 {{
+{_IN_MOTION}
+}};
+return moving();
+"""
 
 
 @wp.func_native(WALK_MOVING)

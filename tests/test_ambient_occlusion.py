@@ -207,3 +207,13 @@ def test_escaped_rays_alone_are_an_open_sky():
         albedo=up,
     )
     np.testing.assert_array_equal(gi.reconstruct(samples, gi.AmbientOcclusion(rays=16)).image, 1.0)
+
+
+def test_without_shrinking_leaves_grow():
+    """Splats that do not shrink stand in the way of what was seen: small far things darken the picture."""
+    scene = gi.scenes.butterflies(motion=0.0, aperture=0.0)
+    with_it, without = (
+        gi.render(scene, gi.AmbientOcclusion(spp=2, rays=16, radius=0.5, shrink=on), size=(32, 20)).image
+        for on in (True, False)
+    )
+    assert without.mean() < with_it.mean() - 0.01

@@ -218,3 +218,21 @@ def test_wrong_buffers_are_refused():
         gi.TemporalLightField(radius=0.0)
     with pytest.raises(ValueError, match="the scene moves, which LightField cannot render"):
         gi.render(gi.scenes.butterflies(), gi.LightField(), size=(8, 8))
+
+
+@pytest.mark.parametrize(("kind", "part"), [("light field", 0.5), ("temporal", 1.0)])
+def test_samples_of_a_lens_know_the_view_of_its_centre(kind, part):
+    """Rays through the lens's centre alone give the pinhole's picture, nearer than what the lens sees; ours by half.
+
+    The earlier method takes samples from its worst-case radius, which keeps it from more.
+    """
+    scene = layers(motion=None, aperture=0.5)
+    sharp = dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, lens_radius=0.0))
+    truth = gi.render(sharp, gi.PathTracing(spp=256, max_depth=1), size=SIZE).image
+    blurred = gi.render(scene, gi.PathTracing(spp=256, max_depth=1), size=SIZE).image
+    samples = gi.sample(scene, spp=1, size=SIZE, primary=True)
+    method = METHODS["light-field" if kind == "light field" else "temporal-light-field"]
+    state = method.reconstruction(samples, gi.Device("cpu"), 0)
+    state.lens.stop = 0.0
+    state.gather(0, 32, 32)
+    assert np.sqrt(np.mean((state.image() - truth) ** 2)) < part * np.sqrt(np.mean((blurred - truth) ** 2))

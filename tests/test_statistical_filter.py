@@ -2,10 +2,13 @@
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import warpgi as gi
 from warpgi.__main__ import main
+from warpgi.animate import frame_seed
 from warpgi.filter_animation import high_share
+from warpgi.image import to_srgb8
 from warpgi.modes import Rule, by_epsilon, noise_edges, percent_var, principal_components
 from warpgi.resampling import trace_pixels
 from warpgi.statistical_filtering import FrameMatrix, Projection
@@ -343,10 +346,14 @@ def test_importance_sampling():
     share = high_share(truncation, high)
     np.testing.assert_allclose(share, np.clip((truncation - 1.2) / 0.8, 0.0, 1.0), atol=1e-6)
     assert 0 < (share > 0).sum() < share.size
+    pixels = np.arange(share.size)
     for number in range(5):
         a, b = plain[number].layers["indirect"], mixed[number].layers["indirect"]
         np.testing.assert_array_equal(a[share == 0], b[share == 0])
-        assert (a[share == 1] != b[share == 1]).any()
+        seed = frame_seed(frame_seed(0, number), number)
+        new = trace_pixels(light().scene(number), pixels, gi.PathTracing(spp=8), SIZE, seed, gi.Device("cpu"))
+        expected = (1.0 - share[..., None]) * a + share[..., None] * new.reshape(a.shape)
+        np.testing.assert_allclose(b, expected, rtol=1e-5, atol=1e-6)
     assert mixed.modes.average_spp == 2 + 8 * (share > 0).mean()
 
 
@@ -409,3 +416,26 @@ def test_filter_on_the_command_line(tmp_path, capsys):
         np.testing.assert_array_equal(ours.image, theirs.image)
     assert main(["filter", str(tmp_path / "none-{:02d}.exr")]) == 2
     assert "none-00.exr does not exist" in capsys.readouterr().err
+
+
+def test_preview(tmp_path, capsys):
+    """Noisy, filtered and reference side by side, an animated PNG of as many pictures as frames, at the sequence's
+    speed; animations that do not fit together are refused."""
+    noisy = gi.render_animation(light(3), gi.PathTracing(spp=1), SIZE, device="cpu", out=tmp_path / "n-{:02d}.exr")
+    smooth = gi.filter_animation(noisy, device="cpu")
+    gi.write_preview(tmp_path / "a.png", noisy, smooth, noisy, exposure=1.0)
+    with Image.open(tmp_path / "a.png") as image:
+        assert image.size == (3 * 16 + 2 * 4, 16)
+        assert image.n_frames == 3
+        image.seek(2)
+        assert image.info["duration"] == pytest.approx(1000.0 / 24.0, abs=1.0)
+        shown = np.asarray(image.convert("RGB"))
+    np.testing.assert_array_equal(shown[:, 20:36], to_srgb8(smooth[2].image, 1.0)[0])
+    np.testing.assert_array_equal(shown[:, 40:], to_srgb8(noisy[2].image, 1.0)[0])
+    with pytest.raises(ValueError, match="have 3, 1 frames"):
+        gi.write_preview(tmp_path / "b.png", noisy, gi.Animation([noisy[0]], (0,)))
+    files = str(tmp_path / "n-{:02d}.exr")
+    out = ["--out", str(tmp_path / "f" / "f-{:02d}.exr"), "--device", "cpu"]
+    assert main(["filter", files, *out, "--reference", files, "--preview", str(tmp_path / "c.png")]) == 0
+    with Image.open(tmp_path / "c.png") as image:
+        assert (image.size, image.n_frames) == ((56, 16), 3)

@@ -4,7 +4,7 @@ __version__ = "0.1.0"
 
 from warpgi import scenes  # type: ignore[attr-defined]
 from warpgi.animate import render_animation
-from warpgi.animation import Animation
+from warpgi.animation import Animation, write_preview
 from warpgi.camera import Camera
 from warpgi.denoise import denoise
 from warpgi.device import Device
@@ -93,4 +93,5 @@ __all__ = [
     "scenes",
     "to_mitsuba",
     "versions",
+    "write_preview",
 ]

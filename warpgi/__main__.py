@@ -15,6 +15,8 @@ import numpy as np
 import tyro
 
 import warpgi as gi
+from warpgi.animate import noisy_pattern
+from warpgi.frame_files import frame_path
 from warpgi.image import check_output
 from warpgi.load import SUFFIXES
 from warpgi.methods import DENOISERS as DENOISING_METHODS
@@ -114,6 +116,10 @@ class AnimateCommand:
     """Keep files that are whole and of these very frames, and render the others."""
     vary_seed: bool = True
     """Each frame has random numbers of its own; without, a still sequence has equal frames."""
+    preview: Path | None = None
+    """Animated PNG of the frames; of filtered ones their noisy input is beside them."""
+    exposure: float = 0.0
+    """Stops by which the preview is brightened."""
     device: str | None = None
     """cpu, cuda:0, ...; a GPU if there is one."""
     threads: int | None = None
@@ -138,6 +144,12 @@ class AnimateCommand:
             self.vary_seed,
         )
         _told(sequence.name, animation, "rendered")
+        if self.preview is not None:
+            shown = [animation]
+            if animation.modes is not None:
+                path = frame_path(noisy_pattern(self.out))
+                shown.insert(0, gi.Animation([path(number) for number in animation.frames], animation.frames))
+            _show(self.preview, shown, self.exposure)
 
 
 @dataclass(frozen=True)
@@ -152,6 +164,12 @@ class FilterCommand:
     """The filtered frames' files, with modes.npz, the basis functions, beside them."""
     resume: bool = False
     """Keep filtered frames that are whole and of these very noisy ones."""
+    preview: Path | None = None
+    """Animated PNG: noisy and filtered frames, and the reference's if there are any, side by side."""
+    reference: str | None = None
+    """Files of reference frames for the preview."""
+    exposure: float = 0.0
+    """Stops by which the preview is brightened."""
     device: str | None = None
     """cpu, cuda:0, ...; a GPU if there is one."""
     threads: int | None = None
@@ -164,6 +182,9 @@ class FilterCommand:
         noisy = gi.Animation.load(self.frames)
         animation = gi.filter_animation(noisy, self.method, device, sys.stderr.isatty(), self.out, self.resume)
         _told(self.frames, animation, "filtered")
+        if self.preview is not None:
+            reference = [] if self.reference is None else [gi.Animation.load(self.reference)]
+            _show(self.preview, [noisy, animation, *reference], self.exposure)
 
 
 @dataclass(frozen=True)
@@ -358,6 +379,11 @@ def _keep(picture: gi.Render, out: tuple[Path, ...], exposure: float) -> None:
     _warn_of(picture.counts)
     for path in out:
         print(f"wrote {path}")
+
+
+def _show(path: Path, animations: list[gi.Animation], exposure: float) -> None:
+    gi.write_preview(path, *animations, exposure=exposure)
+    print(f"wrote {path}")
 
 
 def _told(name: str, animation: gi.Animation, done: str) -> None:

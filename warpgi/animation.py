@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from collections.abc import Sequence as Series
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from warpgi.frame_files import frame_path
-from warpgi.image import PathLike
+from warpgi.image import PathLike, atomic_write, to_srgb8
 from warpgi.modes import Modes
 from warpgi.result import Render
+
+# White pixels between animations side by side.
+GAP = 4
 
 
 @dataclass(eq=False)
@@ -91,6 +96,46 @@ class Animation:
             ValueError: a frame has no such layer.
         """
         return np.stack([frame_layer(frame, layer) for frame in self])
+
+
+def write_preview(path: PathLike, *animations: Animation, layer: str = "image", exposure: float = 0.0) -> None:
+    """Writes animations side by side, such as noisy, filtered and reference, as one animated PNG (APNG, by Pillow).
+
+    One frame of each is in memory at a time, and all of the 8-bit pictures.
+
+    Args:
+        path: the file to write; its suffix is .png or .apng.
+        animations: of equally many frames of one size.
+        layer: which layer to show.
+        exposure: stops, in [-64, 64]; 1 doubles the light.
+
+    Raises:
+        ValueError: the suffix is another one, or animations differ in length or size, or lack the layer.
+        OSError: the file cannot be written.
+
+    Example:
+        >>> import warpgi as gi
+        >>> noisy = gi.render_animation(gi.scenes.moving_light(frames=2), gi.PathTracing(spp=1), size=(8, 8))
+        >>> gi.write_preview("preview.jpg", noisy)
+        Traceback (most recent call last):
+        ValueError: preview is preview.jpg, expected a name that ends in .png or .apng
+    """
+    if Path(path).suffix.lower() not in (".png", ".apng"):
+        raise ValueError(f"preview is {os.fspath(path)}, expected a name that ends in .png or .apng")
+    if not animations or len({len(animation) for animation in animations}) > 1:
+        lengths = ", ".join(str(len(animation)) for animation in animations) or "none"
+        raise ValueError(f"animations have {lengths} frames, expected equally many")
+    pictures = []
+    for frames in zip(*animations, strict=True):
+        parts = [to_srgb8(frame_layer(frame, layer), exposure)[0] for frame in frames]
+        if len({part.shape for part in parts}) > 1:
+            raise ValueError(f"animations have frames of {' and '.join(str(part.shape[:2]) for part in parts)} pixels")
+        gap = np.full((parts[0].shape[0], GAP, 3), 255, np.uint8)
+        row = [each for part in parts for each in (part, gap)][:-1]
+        pictures.append(Image.fromarray(np.concatenate(row, axis=1)))
+    duration = 1000.0 / animations[0].fps
+    with atomic_write(path) as temporary:
+        pictures[0].save(temporary, format="PNG", save_all=True, append_images=pictures[1:], duration=duration, loop=0)
 
 
 def frame_layer(frame: Render, name: str) -> np.ndarray:

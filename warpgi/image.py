@@ -331,6 +331,26 @@ def tone_map(image: Any, exposure: float = 0.0) -> np.ndarray:
     return np.where(peak <= K_S, colour, colour / bright * compressed * keep + compressed * (1.0 - keep))
 
 
+def to_srgb8(image: Any, exposure: float = 0.0) -> tuple[np.ndarray, int]:
+    """Radiance as 8-bit sRGB, shape (H, W, 3), by `tone_map`, then `encode_srgb`; and how many pixels are magenta.
+
+    Args:
+        image: linear radiance, shape (H, W, 3). Pixels with NaN or infinity are painted magenta.
+        exposure: stops, in [-64, 64].
+
+    Raises:
+        ValueError: the image has another shape.
+    """
+    values = np.asarray(image, dtype=np.float64)
+    if values.ndim != 3 or values.shape[2] != 3 or values.size == 0:
+        raise ValueError(f"image has shape {values.shape}, expected (H, W, 3) with H, W above 0")
+    bad = np.asarray(~np.isfinite(values).all(axis=2))
+    mapped = tone_map(np.where(bad[..., None], 0.0, values), exposure)
+    pixels = np.floor(255.0 * encode_srgb(mapped) + 0.5).astype(np.uint8)
+    pixels[bad] = MAGENTA
+    return pixels, int(np.count_nonzero(bad))
+
+
 def write_png(path: PathLike, image: Any, exposure: float = 0.0) -> int:
     """Writes radiance as an 8-bit sRGB picture: `tone_map`, then `encode_srgb`, rounded.
 
@@ -346,16 +366,9 @@ def write_png(path: PathLike, image: Any, exposure: float = 0.0) -> int:
         ValueError: the image has another shape.
         OSError: the file cannot be written.
     """
-    values = np.asarray(image, dtype=np.float64)
-    if values.ndim != 3 or values.shape[2] != 3 or values.size == 0:
-        raise ValueError(f"image has shape {values.shape}, expected (H, W, 3) with H, W above 0")
-    bad = np.asarray(~np.isfinite(values).all(axis=2))
-    mapped = tone_map(np.where(bad[..., None], 0.0, values), exposure)
-    pixels = np.floor(255.0 * encode_srgb(mapped) + 0.5).astype(np.uint8)
-    pixels[bad] = MAGENTA
+    pixels, bad_count = to_srgb8(image, exposure)
     with atomic_write(path) as temporary:
         Image.fromarray(pixels).save(temporary, format="PNG")
-    bad_count = int(np.count_nonzero(bad))
     if bad_count:
         warnings.warn(
             f"{os.fspath(path)} shows {bad_count} pixels in magenta: they are NaN or infinite",

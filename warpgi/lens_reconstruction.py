@@ -61,7 +61,7 @@ class LensSampling:
             raise ValueError("samples lack the camera of primary rays, expected those of sample(..., primary=True)")
         self.moving = samples.hit_motion is not None and samples.time is not None
         self.lens = lens.Lens()
-        self.lens.width, self.lens.moving = samples.width, int(self.moving)
+        self.lens.width, self.lens.moving, self.lens.stop = samples.width, int(self.moving), 1.0
         self.lens.radius = abs(samples.coc[1]) * step
         columns = (wp.vec3(*(matrix[:3, i] / matrix[3, 3])) for i in (3, 0, 1))
         self.lens.corner, self.lens.right, self.lens.down = columns

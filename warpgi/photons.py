@@ -47,6 +47,10 @@ class Shot:
     """Cell of the aim of each path, shape (paths,)."""
     stored: np.ndarray
     """Photons of each path, shape (paths,)."""
+    first_face: np.ndarray | None = None
+    """Triangle that each path met first, -1: none, shape (paths,); of paths whose starts were given."""
+    first_bary: np.ndarray | None = None
+    """Where it did, shape (paths, 2)."""
 
     def of_kind(self, *kinds: int) -> np.ndarray:
         """Numbers of the photons of these kinds, int32."""
@@ -76,6 +80,7 @@ class PhotonSource:
         sky = float(np.mean(scene.struct.environment)) * 4.0 * np.pi**2 * scene.radius**2
         emission.environment = sky / max(sky + scene.power, 1e-30)
         self.dark = sky + scene.power <= 0.0
+        emission.starts = self.device.zeros(0, kernels.Start)
         self.emission = emission
         self._anywhere = self.device.zeros(0, float)
         self._aim: wp.array | None = None
@@ -89,6 +94,13 @@ class PhotonSource:
         if self._aim is None:
             self._aim = self._learn_aim()
         return self._shoot(paths, number, True, self._aim)
+
+    def shoot_from(self, starts: np.ndarray) -> Shot:
+        """All photons of paths with these starts, records of `kernels.photons.Start`."""
+        self.emission.starts = self.device.array(starts, kernels.Start)
+        shot = self._shoot(len(starts), 0, False, self._anywhere)
+        self.emission.starts = self.device.zeros(0, kernels.Start)
+        return shot
 
     def tree(self, shot: Shot, indices: np.ndarray) -> SplatTree:
         """A tree over some photons."""
@@ -116,10 +128,14 @@ class PhotonSource:
         emission.map, emission.part, emission.caustics, emission.aim_cdf = number, 1.0 / paths, int(caustics), aim
         slots = 1 if caustics else SLOTS
         size = min(paths, BATCH)
+        given = len(emission.starts) > 0
         room = _photons(device, size * slots, self.fields)
         tracks = kernels.Tracks()
         for name in ("stored", "rays", "dropped", "cell"):
             setattr(tracks, name, device.zeros(size, int))
+        if given:
+            tracks.face, tracks.bary = device.zeros(size, int), device.zeros(size, wp.vec2)
+            first_face, first_bary = np.full(paths, -1, np.int32), np.zeros((paths, 2), np.float32)
         ends = device.zeros(size, int)
         parts: list[tuple[kernels.Photons, int]] = []
         cells, stored = np.empty(paths, np.int32), np.empty(paths, np.int32)
@@ -145,8 +161,12 @@ class PhotonSource:
             dropped += int(tracks.dropped.numpy()[:count].sum(dtype=np.int64))
             cells[first : first + count] = tracks.cell.numpy()[:count]
             stored[first : first + count] = tracks.stored.numpy()[:count]
+            if given:
+                first_face[first : first + count] = tracks.face.numpy()[:count]
+                first_bary[first : first + count] = tracks.bary.numpy()[:count]
         photons = parts[0][0] if len(parts) == 1 else _joined(device, parts, total, self.fields)
-        return Shot(photons, total, paths, rays, dropped, cells, stored)
+        firsts = (first_face, first_bary) if given else ()
+        return Shot(photons, total, paths, rays, dropped, cells, stored, *firsts)
 
 
 def _photons(device: Device, count: int, fields: dict[str, type]) -> kernels.Photons:

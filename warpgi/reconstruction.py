@@ -43,6 +43,8 @@ class Preprocessing:
     """Part of an input ray's length, at either end, in which a crossed splat is not shrunk (2.3.1)."""
     lone_radius: float
     """Part of its radius that a splat keeps where it is alone in the first surface (2.5)."""
+    shrink: bool = True
+    """Whether splats that input rays cross shrink (2.3.1)."""
 
 
 @dataclass(frozen=True)
@@ -188,7 +190,8 @@ class Reconstruction:
 
     def _fit(self) -> None:
         """Makes splats ready for rays, once they are sized."""
-        self.tree.shrink(self.rays, self.preprocessing.margin, self.escaped, self.extent)
+        if self.preprocessing.shrink:
+            self.tree.shrink(self.rays, self.preprocessing.margin, self.escaped, self.extent)
 
     def _send(self, hemispheres: Hemispheres, count: int, outputs: list[wp.array]) -> None:
         inputs = [self.tree.struct, self.sky, hemispheres, self.seed, self.noise, *self._kept_parts()]

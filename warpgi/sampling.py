@@ -34,11 +34,14 @@ GLOSS = (
 PRIMARY_BYTES, SECONDARY_BYTES = 12 * len(PRIMARY), 12 * len(SECONDARY + HIT_LIGHT)
 
 
-def path_settings(job: Job, max_depth: int, roulette_depth: int, sampler: Sampler) -> PathSettings:
+def path_settings(
+    job: Job, max_depth: int, roulette_depth: int, sampler: Sampler, with_layers: bool = False
+) -> PathSettings:
     """Settings of the kernels that trace samples."""
     settings = PathSettings()
     settings.max_depth, settings.roulette_depth, settings.seed = max_depth, roulette_depth, job.seed
     settings.sampler = int(rng.SOBOL if sampler is Sampler.SOBOL else rng.INDEPENDENT)
+    settings.layers = int(with_layers)
     return settings
 
 
@@ -70,7 +73,7 @@ def trace_sample_buffer(
             of_hits, of_rays = of_hits | more_of_hits, of_rays | more_of_rays
     if scene.camera.lens_radius > 0.0:
         of_hits["lens"] = wp.vec2
-    paths = path_settings(job, max_depth, roulette_depth, sampler)
+    paths = path_settings(job, max_depth, roulette_depth, sampler, with_gloss)
     arrays = _trace(job, film, hits, spp, light_samples, paths, of_hits, of_rays)
     # on cpu these are the very arrays, which the buffer keeps alive
     values = {name: getattr(arrays, name).numpy() for name in of_hits | of_rays}

@@ -1,4 +1,4 @@
-"""Where instant radiosity fails: spikes near virtual lights, and corners that go dark where these are cut off."""
+"""Where instant radiosity fails: spikes near lights, corners that go dark where these are cut off, and flicker."""
 
 from __future__ import annotations
 
@@ -39,7 +39,32 @@ def edges(near: gi.NearLight, device: gi.Device) -> Value:
     return value if near is gi.NearLight.CLAMPED else Value(abs(value.value), value.error)
 
 
+def flicker(paths: int, renewed: int | None, device: gi.Device) -> Value:
+    """Flicker of indirect light over its mean, while a light moves under the Cornell box's ceiling."""
+    sequence, frames, size = gi.scenes.moving_light(frames=100), range(6), (32, 32)
+    path = gi.PathTracing(spp=REFERENCE_SPP // 2)
+    truth = np.stack(
+        [gi.render(sequence.scene(i), path, size, 99, device).layers["indirect"] for i in frames], dtype=np.float64
+    )
+    values = []
+    for seed in range(3):
+        method = gi.InstantRadiosity(paths=paths, renewed_paths=renewed)
+        animation = gi.render_animation(sequence, method, size, seed, device, frames=frames)
+        values.append(gi.flicker(animation.stack("indirect"), truth) / truth.mean())
+    return mean_value(values)
+
+
 ROWS = (
+    *(
+        Failure(
+            "instant-radiosity",
+            "moving-light",
+            f"flicker over the mean, {paths} paths, {'fresh' if renewed is None else f'{renewed} renewed'}",
+            bound,
+            partial(flicker, paths, renewed),
+        )
+        for paths, renewed, bound in ((16, None, None), (64, None, None), (256, None, None), (64, 2, 0.12))
+    ),
     *(
         Failure(
             "instant-radiosity",

@@ -44,7 +44,9 @@ class AmbientOcclusion:
     """Factor by which distances along a splat's normal count for more, 1 or above."""
     margin: float = 1e-3
     """Part of an input ray at either end in which the splats that it crosses do not shrink, in [0, 0.5)."""
-
+    shrink: bool = True
+    """Shrink the splats that input rays cross, so that nothing is in the way of what was seen; False lets leaves and
+    edges grow (Lehtinen et al. 2012, fig. 4)."""
     lone_radius: float = 1.0
     """Part of its radius that a splat keeps where it alone is the first surface on a ray, in (0, 1]."""
 
@@ -85,7 +87,7 @@ class AmbientOcclusion:
 
     def reconstruction(self, samples: SampleBuffer, device: Device, seed: int) -> Reconstruction:
         """Splats made of a sample buffer, ready for `gather`."""
-        preprocessing = Preprocessing(self.neighbours, self.alpha, self.margin, self.lone_radius)
+        preprocessing = Preprocessing(self.neighbours, self.alpha, self.margin, self.lone_radius, self.shrink)
         return Reconstruction(samples, device, preprocessing, seed, reach=self.radius)
 
     def estimate(self, job: Job, state: Reconstruction, film: Film, first: int, count: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
@@ -12,13 +13,14 @@ import warp as wp
 from warpgi import checks
 from warpgi.film import Film
 from warpgi.job import Job
+from warpgi.kept_paths import KeptPaths
 from warpgi.kernels import instant_radiosity as kernels
 from warpgi.kernels import photons as photon_kernels
 from warpgi.kernels import rng
 from warpgi.kernels import vpls as vpl_kernels
 from warpgi.materials import Coated, Conductor, Dielectric, Mirror
 from warpgi.methods.path import Sampler
-from warpgi.photons import BATCH_BYTES, PHOTON_BYTES, PhotonSource
+from warpgi.photons import BATCH_BYTES, PHOTON_BYTES, PhotonSource, Shot
 from warpgi.vpls import VPL_BYTES, make_vpls
 
 # Lights that a path leaves behind, for a guess at memory before any is traced.
@@ -80,6 +82,10 @@ class InstantRadiosity:
     min_roughness: float = 0.05
     """Rough metal and coats of this roughness or more are lit by virtual lights and become some; smoother ones are
     followed by rays, in (0, 1]."""
+    renewed_paths: int | None = None
+    """In a sequence: paths that are made anew from frame to frame at most. The others are kept, weighted by their
+    Voronoi cells, as long as the moved light reaches what they met (Laine et al. 2007), so that nothing flickers;
+    nor do the camera's random numbers change. None: each frame has a set of its own."""
     light_samples: int = 2
     """Shadow rays to lights from each camera path's first surface."""
     sampler: Sampler = Sampler.SOBOL
@@ -90,6 +96,12 @@ class InstantRadiosity:
             checks.count(name, getattr(self, name))
         if self.set_spp is not None:
             checks.count("set_spp", self.set_spp)
+        if self.renewed_paths is not None:
+            checks.count("renewed_paths", self.renewed_paths, 0)
+            if self.set_spp is not None:
+                raise ValueError(
+                    f"renewed_paths is given, expected None where set_spp is {self.set_spp}: one set is kept"
+                )
         if not isinstance(self.near_light, NearLight):
             raise TypeError(f"near_light is {self.near_light!r}, expected a NearLight")
         if self.near_distance is not None:
@@ -126,6 +138,18 @@ class InstantRadiosity:
         lighting = Lighting(self, job)
         if film.spp() < self.spp:
             lighting.use(film.spp() // (self.set_spp or self.spp))
+        return lighting
+
+    @property
+    def prepare_next(self) -> Callable[..., Lighting]:
+        """The lights of a frame out of those of the frame before; none where each frame has its own."""
+        if self.renewed_paths is None:
+            raise AttributeError("frames do not build on each other where renewed_paths is None")
+        return self._prepare_next
+
+    def _prepare_next(self, job: Job, film: Film, before: Lighting | None) -> Lighting:
+        lighting = Lighting(self, job)
+        lighting.keep(before)
         return lighting
 
     def estimate(self, job: Job, state: Lighting, film: Film, first: int, count: int) -> None:
@@ -179,6 +203,7 @@ class Lighting:
         view.goes_on = int(job.scene.struct.visible_light != 0 or sharp or compensated)
         self.view = view
         self.vpls = vpl_kernels.Vpls()
+        self.kept: KeptPaths | None = None
         self.number = -1
         self.counts = dict.fromkeys(("vpl_sets", "vpl_paths", "vpls", "photon_rays", "nonfinite_photons"), 0)
 
@@ -194,11 +219,24 @@ class Lighting:
         if number == self.number:
             return
         self.number = number
-        shot = self.source.shoot(self.settings.paths, number)
+        self._light(self.source.shoot(self.settings.paths, number), self.settings.paths)
+
+    def keep(self, before: Lighting | None) -> None:
+        """Makes the lights of a frame, of those before it what is still lit."""
+        settings, self.number = self.settings, 0
+        if before is None or before.kept is None:
+            self.kept = KeptPaths(self.source, settings.paths, self.job.seed)
+        else:
+            # kept paths have kept random numbers, and noise of the camera's would flicker too
+            self.source.emission.seed, self.view.seed = before.source.emission.seed, before.view.seed
+            self.kept = before.kept.advance(self.source, settings.renewed_paths or 0)
+        self._light(self.kept.shoot(self.source), self.kept.made)
+
+    def _light(self, shot: Shot, made: int) -> None:
         self.vpls = make_vpls(self.job.scene, shot.photons, shot.count, self.joining.sharpest)
         self._shot = shot  # structs do not keep their arrays alive
         self.counts["vpl_sets"] += 1
-        self.counts["vpl_paths"] += shot.paths
+        self.counts["vpl_paths"] += made
         self.counts["vpls"] += shot.count
         self.counts["photon_rays"] += shot.rays
         self.counts["nonfinite_photons"] += shot.dropped

@@ -98,7 +98,7 @@ class PathTracing:
         settings.max_depth = self.max_depth or NEVER
         settings.roulette_depth = self.roulette_depth or NEVER
         settings.sampler = int(rng.SOBOL if self.sampler is Sampler.SOBOL else rng.INDEPENDENT)
-        settings.seed = job.seed
+        settings.seed, settings.layers = job.seed, 0
         return settings
 
     def estimate(self, job: Job, state: PathSettings, film: Film, first: int, count: int) -> None:
