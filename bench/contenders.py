@@ -45,6 +45,10 @@ LADDERS: dict[str, tuple[Settings, ...]] = {
     "a-trous": powers(64),
     "random-parameter-filter": powers(16),
     "irradiance-filter": powers(64),
+    "meshless-hierarchy": tuple(
+        {"spp": spp, "rays": rays, "error": error, "primary_hits": max(4, spp)}
+        for spp, rays, error in ((1, 64, 0.5), (2, 64, 0.4), (4, 128, 0.4), (8, 256, 0.4), (16, 512, 0.3))
+    ),
 }
 
 #: The same with an irradiance cache: samples, primary hits and rays per pixel, and rays of a record.

@@ -17,6 +17,7 @@ from bench.failures import (
     instant_radiosity,
     irradiance_cache,
     light_field,
+    meshless_hierarchy,
     path,
     photon_map,
     statistical_filter,
@@ -29,6 +30,7 @@ from warpgi.image import atomic_write
 FAILURES: tuple[Failure, ...] = (
     *path.ROWS,
     *light_field.ROWS,
+    *meshless_hierarchy.ROWS,
     *ambient_occlusion.ROWS,
     *photon_map.ROWS,
     *irradiance_cache.ROWS,

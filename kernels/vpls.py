@@ -6,8 +6,18 @@ from warpgi.kernels.bsdf import wide_value
 from warpgi.kernels.direct import SHADOW_SHORTER, reflects
 from warpgi.kernels.photons import Photons
 from warpgi.kernels.rng import Sampler, sample_2d
-from warpgi.kernels.sampling import INV_PI, PI, make_frame, to_world
-from warpgi.kernels.scene import DIFFUSE, Hit, Scene, ShapeRecord, Surface, occluded, offset_origin, surface_at
+from warpgi.kernels.sampling import INV_PI, PI, make_frame, square_to_cosine_hemisphere, to_world
+from warpgi.kernels.scene import (
+    DIFFUSE,
+    Hit,
+    Scene,
+    ShapeRecord,
+    Surface,
+    closest_hit,
+    occluded,
+    offset_origin,
+    surface_at,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -21,6 +31,9 @@ SPHERICAL = wp.constant(3)
 SPHERE_SAMPLES = wp.constant(16)
 SPHERE_NEAR = wp.constant(4.0)
 SPHERE_PAIR = wp.constant(1 << 16)
+# Part of a texel's width, and of a distance, by which a shadow map may be wrong before something is in shadow.
+MAP_BIAS = wp.constant(1.0)
+MAP_ROUNDING = wp.constant(1.0e-4)
 # The plastic number's powers: points of Roberts' lattice are even in the square at any count.
 LATTICE_X = wp.constant(0.7548776662466927)
 LATTICE_Y = wp.constant(0.5698402909980532)
@@ -40,6 +53,9 @@ class Vpls:
     turned: wp.array[float]  # factor on a diffuse light's intensity seen from beyond its shading normal's horizon
     albedo: wp.array[wp.vec3]
     incident: wp.array[wp.vec3]  # towards where the light came from
+    # shadow maps, one a light: distance of what is seen through the texels of a square over its hemisphere
+    map_side: int  # texels, 0: visibility by shadow rays
+    depth: wp.array[float]
 
 
 @wp.struct
@@ -54,11 +70,13 @@ class Joining:
 
 @wp.kernel
 def light_up(
-    offset: int, scene: Scene, photons: Photons, sharpest: float, first: int, flux_scale: wp.array[float], vpls: Vpls
+    offset: int,
+    scene: Scene,
+    photons: Photons,
+    vpls: Vpls,
 ):
-    """One thread makes one photon a light, number `first` + i; `flux_scale` weighs the photons, empty: all alike."""
+    """One thread makes one photon a light."""
     i = offset + wp.tid()
-    k = first + i
     hit = Hit()
     hit.face = photons.face[i]
     hit.u = photons.bary[i][0]
@@ -68,21 +86,19 @@ def light_up(
     s = surface_at(scene, hit, shape)
     w = photons.incident[i]
     side = wp.where(wp.dot(s.ng, w) >= 0.0, 1.0, -1.0)
-    vpls.target[k] = s.p + s.ng * (side * s.offset)
-    vpls.normal[k] = s.ng * side
+    vpls.target[i] = s.p + s.ng * (side * s.offset)
+    vpls.normal[i] = s.ng * side
     flux = photons.flux[i]
-    if flux_scale.shape[0] > 0:
-        flux = flux * flux_scale[i]
     if shape.kind == DIFFUSE:
         flux = wp.cw_mul(flux, s.albedo) * INV_PI
-    vpls.intensity[k] = flux
+    vpls.intensity[i] = flux
     if vpls.shape.shape[0] > 0:
-        vpls.shape[k] = index
-        vpls.shading[k] = s.n * side
-        vpls.albedo[k] = s.albedo
-        vpls.incident[k] = w
+        vpls.shape[i] = index
+        vpls.shading[i] = s.n * side
+        vpls.albedo[i] = s.albedo
+        vpls.incident[i] = w
         cos = wp.dot(s.n * side, w)
-        vpls.turned[k] = wp.where(cos > 0.0, wp.abs(wp.dot(s.ng, w)) / wp.max(cos, 1.0e-20), 1.0)
+        vpls.turned[i] = wp.where(cos > 0.0, wp.abs(wp.dot(s.ng, w)) / wp.max(cos, 1.0e-20), 1.0)
 
 
 @wp.func
@@ -153,6 +169,63 @@ def from_sphere(
     return total * (2.0 * width / (r2 * float(samples)))
 
 
+@wp.func
+def disc_to_square(p: wp.vec2):
+    """Inverse of the concentric map (Shirley, Chiu 1997)."""
+    r = wp.length(p)
+    a = float(0.0)
+    b = float(0.0)
+    if wp.abs(p[0]) > wp.abs(p[1]):
+        a = wp.where(p[0] < 0.0, -r, r)
+        b = a * wp.atan(p[1] / p[0]) * (4.0 * INV_PI)
+    elif p[1] != 0.0:
+        b = wp.where(p[1] < 0.0, -r, r)
+        a = b * wp.atan(p[0] / p[1]) * (4.0 * INV_PI)
+    return wp.vec2(0.5 * a + 0.5, 0.5 * b + 0.5)
+
+
+@wp.func
+def texel_direction(vpls: Vpls, j: int, texel: int):
+    """Through the middle of a texel: texels are even in the cosine-weighted hemisphere."""
+    u = wp.vec2(
+        (float(texel % vpls.map_side) + 0.5) / float(vpls.map_side),
+        (float(texel // vpls.map_side) + 0.5) / float(vpls.map_side),
+    )
+    return to_world(make_frame(vpls.normal[j]), square_to_cosine_hemisphere(u))
+
+
+@wp.kernel
+def render_maps(offset: int, scene: Scene, vpls: Vpls):
+    """One thread owns one texel of one light's shadow map, and casts a ray for it."""
+    i = offset + wp.tid()
+    texels = vpls.map_side * vpls.map_side
+    j = i // texels
+    vpls.depth[i] = closest_hit(scene, vpls.target[j], texel_direction(vpls, j, i % texels)).t
+
+
+@wp.func
+def seen_in_map(vpls: Vpls, j: int, s: Surface, to_light: wp.vec3, distance: float):
+    """Whether a light's shadow map says that it sees s.
+
+    Where the ray of the texel meets the plane of s its depth is exact, so that flat surfaces do not shadow themselves;
+    a surface as near as s itself, but for a texel's width, is taken for s: the bias of edges and corners.
+    """
+    frame = make_frame(vpls.normal[j])
+    d = to_light * (-1.0 / distance)
+    square = disc_to_square(wp.vec2(wp.dot(frame.s, d), wp.dot(frame.t, d)))
+    x = wp.clamp(int(square[0] * float(vpls.map_side)), 0, vpls.map_side - 1)
+    y = wp.clamp(int(square[1] * float(vpls.map_side)), 0, vpls.map_side - 1)
+    texel = y * vpls.map_side + x
+    ray = texel_direction(vpls, j, texel)
+    needed = distance * (1.0 - MAP_BIAS / float(vpls.map_side))
+    across = wp.dot(s.ng, ray)
+    if across != 0.0:
+        plane = -wp.dot(s.ng, to_light) / across
+        if plane > 0.0:
+            needed = wp.min(needed, plane * (1.0 - MAP_ROUNDING))
+    return vpls.depth[j * vpls.map_side * vpls.map_side + texel] >= needed
+
+
 @wp.struct
 class Reflected:
     radiance: wp.vec3  # towards wo
@@ -195,11 +268,16 @@ def reflect_vpls(
             light = wp.cw_mul(f, vpl_intensity(scene, vpls, joining, j, -wi)) * geometry
         if wp.max(light) <= 0.0:
             continue
-        o = offset_origin(s.p, s.ng, s.offset, wi)
-        d = vpls.target[j] - o
-        distance = wp.length(d)
-        result.shadow_rays = result.shadow_rays + 1
-        if not occluded(scene, o, d / distance, distance * SHADOW_SHORTER):
+        seen = False
+        if vpls.map_side > 0:
+            seen = seen_in_map(vpls, j, s, to_light, wp.sqrt(d2))
+        else:
+            o = offset_origin(s.p, s.ng, s.offset, wi)
+            d = vpls.target[j] - o
+            distance = wp.length(d)
+            result.shadow_rays = result.shadow_rays + 1
+            seen = not occluded(scene, o, d / distance, distance * SHADOW_SHORTER)
+        if seen:
             result.radiance = result.radiance + light
     result.radiance = result.radiance * float(stride)
     return result

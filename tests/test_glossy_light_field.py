@@ -6,10 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import warp as wp
 
 import warpgi as gi
 from warpgi.glossy_reconstruction import GlossyReconstruction
+from warpgi.kernels.glossy_light_field import Lobes
+from warpgi.kernels.glossy_splats import largest_lobe
 from warpgi.samples import SampleBuffer, unit
+
+wp.set_module_options({"enable_backward": False})
 
 # Two parts of a floor, each seen from its own eye: both look at the ceiling, the second at half of what the first sees.
 EYES = np.array([(0.0, -4.0, 3.0), (3.0, -3.0, 3.0)])
@@ -121,3 +126,138 @@ def test_no_bandwidth_at_all_is_the_diffuse_path():
             glossy = gi.reconstruct(zero, method)
             np.testing.assert_array_equal(glossy.layers["indirect"].view("u4"), plain.layers["indirect"].view("u4"))
             assert glossy.counts.pop("lobes") == 0 and glossy.counts == plain.counts
+
+
+@wp.kernel
+def query(
+    lobes: Lobes,
+    x: wp.array[wp.vec3],
+    n: wp.array[wp.vec3],
+    d: wp.array[wp.vec3],
+    axis: wp.array[wp.vec3],
+    found: wp.array[int],
+):
+    i = wp.tid()
+    found[i] = largest_lobe(lobes.tree, lobes.axes, lobes.cones, x[i], n[i], d[i], axis[i], 2.0, lobes.stretch)
+
+
+def bumpy(count=700, seed=5):
+    """Samples of a bumpy glossy ceiling, seen from all about below, of two bandwidths."""
+    rng = np.random.default_rng(seed)
+    hit = np.concatenate([rng.uniform(-1.0, 1.0, (count, 2)), np.ones((count, 1))], axis=1)
+    hit[:, 2] += 0.05 * np.sin(5.0 * hit[:, 0])
+    slope = np.stack([0.25 * np.cos(5.0 * hit[:, 0]), np.zeros(count), -np.ones(count)], axis=1)
+    origin = np.concatenate([rng.uniform(-1.0, 1.0, (count, 2)), np.zeros((count, 1))], axis=1)
+    up = np.tile(np.float32([0, 0, 1]), (count, 1))
+    light = {"radiance": rng.random((count, 3)).astype("f4"), "albedo": np.ones((count, 3), "f4")}
+    bandwidth = np.where(rng.random(count) < 0.5, 4.0, 60.0).astype("f4")
+    points = {"origin": origin.astype("f4"), "hit": hit.astype("f4"), "origin_normal": up, "hit_normal": unit(slope)}
+    return SampleBuffer(count, 1, 1, **light, **points, bandwidth=bandwidth)
+
+
+def test_lobes_against_brute_force():
+    """Sizes are the distance of the k-th neighbour of like direction, and the largest filter is found, as all say."""
+    samples = bumpy()
+    state = gi.LightField().reconstruction(samples, gi.Device("cpu"), 0)
+    order = state.lobe_tree.order.numpy()
+    hit, n = samples.hit[order].astype(np.float64), samples.unit_hit_normal[order].astype(np.float64)
+    axis, kappa = reflect(samples.direction[order].astype(np.float64), n), samples.kappa[order].astype(np.float64)
+    apart = hit[None] - hit[:, None]
+    plain2 = np.square(apart).sum(-1)
+    metric2 = plain2 + 8.0 * np.einsum("ijk,ik->ij", apart, n) ** 2
+    faces = n @ n.T > 0.1
+    wanted = []
+    for i in range(len(hit)):
+        near = np.sort(np.where(faces[i] & (np.arange(len(hit)) != i), metric2[i], np.inf))
+        first = np.flatnonzero(metric2[i] == near[10])[0]
+        limit = plain2[i, first] * 1000.0 / 12.0 * 1.001
+        threshold = 0.5
+        while True:
+            alike = np.exp(kappa[i] * (axis @ axis[i] - 1.0)) >= threshold
+            usable = np.flatnonzero(alike & faces[i] & (metric2[i] < limit) & (np.arange(len(hit)) != i))
+            if len(usable) >= 11 or threshold <= 0.01:
+                break
+            threshold = max(0.75 * threshold, 0.01)
+        usable = usable[np.argsort(metric2[i, usable])][:11]
+        wanted.append(np.sqrt(plain2[i, usable[-1]] if len(usable) else plain2[i, first]))
+    radii = state.lobe_tree.radii().astype(np.float64)
+    # rounding decides otherwise where a direction lies on the threshold
+    assert np.isclose(radii, wanted, rtol=1e-4).mean() > 0.99
+
+    rng = np.random.default_rng(6)
+    count = 400
+    place = rng.integers(0, len(hit), count)
+    x = (hit[place] + rng.normal(0.0, 0.02, (count, 3))).astype("f4")
+    d = unit(np.concatenate([rng.uniform(-1, 1, (count, 2)), np.ones((count, 1))], axis=1))
+    mirrored = reflect(d, n[place].astype("f4"))
+    inputs = [wp.array(a, dtype=wp.vec3, device="cpu") for a in (x, n[place].astype("f4"), d, mirrored)]
+    found = wp.zeros(count, dtype=int, device="cpu")
+    centre = 0.5 * (samples.hit.min(axis=0) + samples.hit.max(axis=0))
+    assert np.allclose(state._hits.numpy(), samples.hit - centre, atol=1e-6)
+    inputs[0] = wp.array((x - centre).astype("f4"), dtype=wp.vec3, device="cpu")
+    wp.launch(query, count, inputs=[state.lobes, *inputs], outputs=[found], device="cpu")
+    found = found.numpy()
+    away = x[:, None] - hit
+    part2 = (np.square(away).sum(-1) + 8.0 * (away * n).sum(-1) ** 2) / radii**2
+    spatial = np.minimum(1.0, (1.0 - np.sqrt(part2)) / np.minimum(1.0, radii / 2.0))
+    usable = (part2 < 1.0) & (d @ n.T < 0.0) & (n[place] @ n.T > 0.5)
+    value = np.where(usable, np.exp(kappa * (mirrored @ axis.T - 1.0)) * spatial, -1.0)
+    best = value.max(axis=1)
+    assert ((best > 0.0) == (found >= 0)).mean() > 0.99
+    met = (found >= 0) & (best > 0.0)
+    assert met.mean() > 0.8
+    np.testing.assert_allclose(value[np.arange(count), found][met], best[met], rtol=1e-3, atol=1e-9)
+
+
+def room(floor, ceiling):
+    """A floor seen from the side, under a ceiling that a light from below lights."""
+
+    def flat(material, height, size, faces):
+        corners = [(-size, height, -size), (-size, height, size), (size, height, size), (size, height, -size)]
+        return gi.Shape(corners, faces, material)
+
+    shapes = [flat(floor, 0.0, 1.0, [(0, 1, 2), (0, 2, 3)]), flat(ceiling, 1.0, 4.0, [(0, 2, 1), (0, 3, 2)])]
+    camera = gi.Camera((0.0, 0.6, 1.6), (0.0, 0.0, 0.0), fov=40)
+    return gi.Scene(shapes, camera, [gi.PointLight((0.3, 0.5, -0.2), (2.0, 1.5, 1.0))])
+
+
+@pytest.mark.parametrize(
+    ("ceiling", "bound"),
+    [(gi.Coated(0.5, 0.02), 0.02), (gi.Conductor(0.02), 0.02), (gi.Mirror(0.8), 0.1)],
+    ids=["coated", "metal", "mirror"],
+)
+def test_energy(ceiling, bound):
+    """Over a coated floor the picture's mean light is path tracing's to 2 %; under a mirror a tenth may be missing.
+
+    What a mirror shows changes from sample to sample, and is taken from the nearest by direction.
+    """
+    scene, size = room(gi.Coated(0.6, 0.05), ceiling), (24, 24)
+    means = [gi.render(scene, gi.LightField(spp=8, rays=64), size, seed=s).layers["indirect"].mean() for s in range(8)]
+    truth = [gi.render(scene, gi.PathTracing(spp=128), size, seed=100 + s).layers["indirect"].mean() for s in range(8)]
+    error = np.sqrt((np.var(means, ddof=1) + np.var(truth, ddof=1)) / 8)
+    assert abs(np.mean(means) - np.mean(truth)) < bound * np.mean(truth) + 3.0 * error
+    assert error < 0.025 * np.mean(truth)
+
+
+def test_same_bits_for_any_threads():
+    """Neither the number of threads nor their pieces change a bit, and no light is lost to a layer."""
+    samples = gi.sample(room(gi.Coated(0.6, 0.05), gi.Coated(0.5, 0.02)), 4, (16, 16), glossy=True)
+    devices = (gi.Device("cpu", 1), gi.Device("cpu", 2, chunk=7), gi.Device("cpu", 3))
+    pictures = [gi.reconstruct(samples, gi.LightField(rays=64), device=device).layers["indirect"] for device in devices]
+    for picture in pictures[1:]:
+        np.testing.assert_array_equal(picture.view("u4"), pictures[0].view("u4"))
+    # layers apart, and one collapsed bandwidth: the same light, reused otherwise
+    collapsed = gi.reconstruct(replace(samples, base_radiance=None), gi.LightField(rays=64)).layers["indirect"]
+    assert (collapsed != pictures[0]).any()
+    assert collapsed.mean() == pytest.approx(pictures[0].mean(), rel=0.05)
+
+
+def test_hair_is_never_brighter_than_its_input():
+    """Thin glossy strands under few samples: no pixel sees more radiance than the brightest ray brought."""
+    rng = np.random.default_rng(7)
+    samples = bumpy(300)
+    normal = unit(rng.normal(size=(300, 3)))
+    samples = replace(samples, hit_normal=normal, bandwidth=np.full(300, 50.0, np.float32))
+    picture = gi.reconstruct(samples, gi.LightField(rays=256))
+    assert np.isfinite(picture.layers["indirect"]).all()
+    assert picture.layers["indirect"].max() <= samples.radiance.max() * (1.0 + 1e-5)

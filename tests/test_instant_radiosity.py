@@ -303,6 +303,46 @@ def test_clamped_light_of_one_vpl_is_bounded():
     assert gi.render(scene, unbounded, (32, 32), device="cpu").layers["indirect"].max() > clamped.max()
 
 
+def test_shadow_maps_agree_with_shadow_rays():
+    """The pictures differ by a texel's width along shadows: half as much with twice as many texels a side."""
+    scene, size = gi.scenes.cornell_box(), (32, 32)
+    method = gi.InstantRadiosity(paths=32, spp=1, near_light=NEAR.CLAMPED)
+    rays = gi.render(scene, method, size, device="cpu")
+    exact = rays.layers["indirect"].astype(np.float64)
+    differs = []
+    for side in (32, 64, 128):
+        mapped = gi.render(scene, dataclasses.replace(method, shadow_map=side), size, device="cpu")
+        differs.append(np.abs(mapped.layers["indirect"] - exact).mean() / exact.mean())
+        # only rays to lamps are left
+        assert mapped.counts["shadow_rays"] < 0.1 * rays.counts["shadow_rays"]
+    # shadows of some ten edges, a texel wide of 128 and in one of two of the lights
+    assert differs[2] < 10.0 / 128.0 / 2.0
+    assert differs[2] < 0.7 * differs[1] < 0.7 * 0.7 * differs[0]
+
+
+def test_shadow_maps_do_not_shadow_flat_walls():
+    """Between floor and ceiling lights see all that faces them: pixels are those of shadow rays at any resolution.
+
+    Where walls meet, a texel that sees the one wall hides a strip as wide of the other.
+    """
+    ceiling = gi.Shape([(x, 1.0, z) for x, _, z in FLOOR[0]], [f[::-1] for f in FLOOR[1]], gi.Diffuse(0.5))
+    shapes = [gi.Shape(*FLOOR, gi.Diffuse(0.5)), ceiling]
+    scene = gi.Scene(shapes, gi.Camera((0, 0.6, 2.5), (0, 0.5, 0)), [gi.PointLight((0.0, 0.5, 0.0), 1.0)])
+    method = gi.InstantRadiosity(paths=32, spp=1, near_light=NEAR.CLAMPED)
+    exact, coarse = (
+        gi.render(scene, dataclasses.replace(method, shadow_map=side), (32, 32), device="cpu").layers["indirect"]
+        for side in (0, 16)
+    )
+    np.testing.assert_allclose(coarse, exact, rtol=1e-6)
+
+
+def test_shadow_maps_that_do_not_fit_are_refused():
+    """Maps beyond the memory limit are named before they are made."""
+    device = gi.Device("cpu", memory_limit=100_000_000)
+    with pytest.raises(ValueError, match=r"(memory_limit|shadow_map) is"):
+        gi.render(gi.scenes.cornell_box(), gi.InstantRadiosity(shadow_map=4096), (8, 8), device=device)
+
+
 def test_progress_is_that_of_independent_sets():
     """The squared error of n sets is that of one over n."""
     scene, size = gi.scenes.cornell_box(), (16, 16)
@@ -339,6 +379,7 @@ def test_pictures_do_not_depend_on_threads_or_memory():
         ({"min_roughness": 0.0}, ValueError, "min_roughness is 0"),
         ({"light_samples": 0}, ValueError, "light_samples is 0"),
         ({"sampler": 1}, TypeError, "sampler is 1"),
+        ({"shadow_map": 5000}, ValueError, "shadow_map is 5000"),
     ],
 )
 def test_bad_settings_are_named(settings, error, message):

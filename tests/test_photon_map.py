@@ -11,7 +11,7 @@ import pytest
 import warp as wp
 from noise import Z_LIMIT
 from scipy.integrate import quad
-from test_photons import estimate
+from test_photons import box, estimate
 
 import warpgi as gi
 from warpgi.device_scene import DeviceScene
@@ -119,6 +119,20 @@ def test_progress_converges_at_the_published_rate():
     assert slopes[1] == pytest.approx(-alpha, abs=3.0 * 0.07 * 0.68)
 
 
+def test_maps_follow_each_other_in_constant_memory():
+    """Every map has photons of its own, and takes the place of the one before."""
+    mapping = mapping_of(caustic(), gi.PhotonMap(**SMALL))
+    seen, sizes = [], []
+    for number in range(4):
+        mapping.use(number)
+        trees = (mapping.maps.diffuse, mapping.maps.caustic)
+        seen.append([tree.blocks.numpy()[:8].tobytes() for tree in trees])
+        sizes.append(sum(tree.nbytes for tree in mapping._trees))
+    assert all(len({blocks[i] for blocks in seen}) == 4 for i in range(2))
+    # counts of photons scatter by 1 / sqrt(20 000), some tenfold where paths are long
+    assert max(sizes) < 1.1 * min(sizes)
+
+
 def test_caustic_of_a_glass_ball():
     """Behind a glass ball light comes together where a path tracer finds it, and as much of it."""
     scene = caustic(lamp_radius=0.3)
@@ -161,6 +175,40 @@ def test_pictures_agree_with_path_tracing():
             assert (np.abs(a - b) < Z_LIMIT * error + 0.08 * a + 0.01 * a.mean()).all()
             # the scatter of the means of 16 blocks is below 1 %; 0.5 % of bias was seen
             assert b.mean() == pytest.approx(a.mean(), rel=0.02)
+
+
+def test_gather_rays_may_go_on():
+    """Where gather rays end changes no mean: light and caustics of the surfaces that they pass take the map's place."""
+    corners = [(x, 0.95, z) for x, z in ((-0.9, -0.9), (0.9, -0.9), (0.9, 0.9), (-0.9, 0.9))]
+    mirror = gi.Shape(corners, [(0, 1, 2), (0, 2, 3)], gi.Mirror(0.9))
+    walls = box(2.0, flip=True, material=gi.Diffuse(0.6))
+    up = gi.SpotLight((0, 0, 0), (0, 1, 0), 2.0, 0.5, 0.6)  # all of its light comes to the walls over the mirror
+    method = gi.PhotonMap(photons=50_000, caustic_photons=50_000, spp=8)
+    camera = gi.Camera((-0.8, 0.8, -0.8), (0.3, -1, 0.3), fov=60.0)
+    for lights in ([up], [gi.PointLight((0.2, 0.1, 0.3), 1.0)]):
+        scene = gi.Scene([walls, mirror], camera, lights)
+        means = []
+        for settings in ({}, {"final_gather": 8, "near": 0.0}, {"final_gather": 8, "near": 1e6}):
+            render = gi.render(scene, dataclasses.replace(method, **settings), (16, 16), device="cpu")
+            means.append(render.layers["indirect"].mean(dtype=np.float64))
+        # 2 000 rays' worth of noise each, and the map's own 0.5 %
+        np.testing.assert_allclose(means, means[0], rtol=0.02)
+
+
+def test_a_coat_weighs_gathered_light_by_its_angle():
+    """Light that only grazes a coated floor gets in by what its coat lets through there, as for photons."""
+    floor = [(-1, 0, -1), (3, 0, -1), (3, 0, 1), (-1, 0, 1)]
+    wall = [(3, 0, -1), (3, 0.4, -1), (3, 0.4, 1), (3, 0, 1)]
+    faces = [(0, 2, 1), (0, 3, 2)]
+    shapes = [gi.Shape(floor, faces, gi.Coated(0.8, 0.5)), gi.Shape(wall, [f[::-1] for f in faces], gi.Diffuse(0.8))]
+    lamp = gi.SpotLight((0, 0.2, 0), (1, 0, 0), 10.0, 0.05, 0.06)  # lights the wall alone
+    scene = gi.Scene(shapes, gi.Camera((1, 2, 0), (1.01, 0, 0), fov=30.0), [lamp])
+    seen, gathered = (
+        gi.render(scene, gi.PhotonMap(**settings), (8, 8), device="cpu").layers["indirect"].mean(dtype=np.float64)
+        for settings in ({"photons": 400_000}, {"photons": 50_000, "spp": 256, "final_gather": 16})
+    )
+    # some 1 % of 260 000 rays meet the wall, and as many photons are seen: 2 % each; without the weight 14 % were seen
+    assert gathered == pytest.approx(seen, rel=0.08)
 
 
 def test_shading_normals_count_for_photons_as_for_paths():

@@ -12,6 +12,8 @@ from scipy.spatial import cKDTree
 
 import warpgi as gi
 import warpgi.photons
+from warpgi.coat import POWERS, fit_coat
+from warpgi.coat import fresnel as smooth_fresnel
 from warpgi.device_scene import DeviceScene
 from warpgi.job import Job
 from warpgi.kernels.density import (
@@ -65,6 +67,7 @@ def search(
     k: int,
     guess2: float,
     limit2: float,
+    scale2: float,
     stretch: float,
     facing: float,
     result: wp.array[vec8],
@@ -73,7 +76,7 @@ def search(
 ):
     """The three searches at each point."""
     i = offset + wp.tid()
-    result[i] = nearest_photons(tree, x[i], n[i], k, guess2, limit2, 1.0, stretch, facing, 0)
+    result[i] = nearest_photons(tree, x[i], n[i], k, guess2, limit2, scale2, stretch, facing, 0)
     near[i] = near_photons(tree, x[i], n[i], limit2, stretch, facing, 0)
     place[i] = nearest_place(covers, x[i], n[i], stretch, facing)
 
@@ -190,6 +193,21 @@ def test_aimed_flux_in_closed_form():
     assert shot.count > 0.4 * shot.paths
 
 
+@pytest.mark.parametrize("degrees", [0.0, 60.0, 85.0])
+def test_coats_let_light_in_by_its_angle(degrees):
+    """A coated floor's photons are what its coat lets through of a sun's light, over the mean of all directions."""
+    material = gi.Coated(0.5, 0.1)
+    square = gi.Shape([(-1, 0, -1), (1, 0, -1), (1, 0, 1), (-1, 0, 1)], [(0, 2, 1), (0, 3, 2)], material)
+    angle = math.radians(degrees)
+    scene = gi.Scene([square], CAMERA, [gi.DistantLight((math.sin(angle), -math.cos(angle), 0.0), 1.0)])
+    shot = source_of(scene).shoot(50_000, 0)
+    coat = fit_coat(material.roughness, material.ior)
+    cos = math.cos(angle)
+    bound = float((1.0 - cos) ** np.array(POWERS) @ coat.coefficients)
+    reflected = min(bound, float(smooth_fresnel(np.array(cos), material.ior)) + coat.excess, 1.0)
+    assert abs(flux_z(shot, 4.0 * cos * (1.0 - reflected) / coat.transmitted)) < Z_LIMIT
+
+
 def test_photons_are_of_equal_power():
     """Roulette keeps the largest channel of the flux, whatever surfaces do to it."""
     flux = arrays(source_of(gi.scenes.cornell_box()).shoot(5000, 0))[2]
@@ -283,8 +301,14 @@ def test_search_equals_brute_force(limit, guess):
     covers.refit_as_balls()
     points = [device.array(x, wp.vec3), device.array(n, wp.vec3)]
     device.launch(
-        search, count, [tree.struct, covers.struct, *points, k, guess, limit2, stretch, facing], [found, near, place]
+        search,
+        count,
+        [tree.struct, covers.struct, *points, k, guess, limit2, 1.0, stretch, facing],
+        [found, near, place],
     )
+    finer, unused = device.zeros(count, vec8), [device.zeros(count, vec8), device.zeros(count, int)]
+    inputs = [tree.struct, covers.struct, *points, k, guess, limit2, 0.25, stretch, facing]
+    device.launch(search, count, inputs, [finer, *unused])
     order, place = covers.order.numpy(), place.numpy()
     assert 0.1 < (place >= 0).mean() < 1.0
     for i in range(count):
@@ -301,6 +325,10 @@ def test_search_equals_brute_force(limit, guess):
         if len(taken) < k:
             sums = flux[taken].sum(axis=0)
         assert found.numpy()[i][3] == pytest.approx(h2, rel=1e-5)
+        # a finer map's radius is a part of that, and so are its photons
+        assert finer.numpy()[i][3] == pytest.approx(0.25 * h2, rel=1e-5)
+        inner = flux[taken[m2[taken] < 0.25 * h2]].sum(axis=0)
+        np.testing.assert_allclose(finer.numpy()[i][:3], inner, rtol=1e-5)
         np.testing.assert_allclose(found.numpy()[i][:3], sums, rtol=1e-5)
         if limit < np.inf:
             np.testing.assert_allclose(near.numpy()[i][:3], flux[taken].sum(axis=0), rtol=1e-5)
@@ -316,7 +344,18 @@ def test_radii_equal_scipys(k):
     x, n = arrays(shot)[0][:300] + np.float32(1e-3), arrays(shot)[1][:300]
     device = source.device
     found, near, place = device.zeros(300, vec8), device.zeros(300, vec8), device.zeros(300, int)
-    inputs = [tree.struct, tree.struct, device.array(x, wp.vec3), device.array(n, wp.vec3), k, 0.0, 1e30, 0.0, -2.0]
+    inputs = [
+        tree.struct,
+        tree.struct,
+        device.array(x, wp.vec3),
+        device.array(n, wp.vec3),
+        k,
+        0.0,
+        1e30,
+        1.0,
+        0.0,
+        -2.0,
+    ]
     device.launch(search, 300, inputs, [found, near, place])
     expected = cKDTree(arrays(shot)[0]).query(x, k=k)[0][:, -1]
     np.testing.assert_allclose(np.sqrt(found.numpy()[:, 3]), expected, rtol=1e-5)

@@ -119,10 +119,8 @@ class Reconstruction:
         self.counts |= {"splats": len(splats), "reconstruction_rays": 0}
         for _ in range(recursions):
             self._relight(splats, recursive_rays)
-        self._per_pixel = samples.spp if hits is None else hits.per_pixel
-        self._receivers = self._make_receivers(
-            self.primary, self._receiver_origins, self._receiver_normals, self._per_pixel
-        )
+        per_pixel = self._per_pixel = samples.spp if hits is None else hits.per_pixel
+        self._receivers = self._make_receivers(self.primary, self._receiver_origins, self._receiver_normals, per_pixel)
         self._found = np.zeros(4, np.int64)  # beside what `_gathered` counts
         self._gathered = self._make_gathered(len(self.primary))
         self._gathered.inverse_distance = device.zeros(len(self.primary) if with_distance else 0, float)
@@ -170,6 +168,14 @@ class Reconstruction:
         known = self.rays_done - self._gathered.counts.numpy()[:, 0]
         result[self.primary] = self._gathered.inverse_distance.numpy() / np.maximum(known, 1)
         return result
+
+    def irradiance_at(self, hits: np.ndarray, rays: int) -> wp.array:
+        """Irradiance at some of the primary hits, by number, from `rays` rays each, vec3 on the device."""
+        receivers = self._make_receivers(hits, self._receiver_origins, self._receiver_normals, self._per_pixel)
+        gathered = self._make_gathered(len(hits))
+        self._trace(receivers, gathered, len(hits), 0, rays, rays)
+        known = rays - gathered.counts.numpy()[:, 0]
+        return self.device.array(np.pi * gathered.radiance.numpy() / np.maximum(known, 1)[:, None], wp.vec3)
 
     def near(self) -> np.ndarray:
         """Share of each sample's rays that met a surface within reach, shape (N,); 0 without a primary hit."""

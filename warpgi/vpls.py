@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import warp as wp
 
 from warpgi.device import Device
@@ -30,24 +29,29 @@ def make_vpls(
     scene: DeviceScene,
     photons: photon_kernels.Photons,
     count: int,
-    sharpest: float,
-    flux_scale: np.ndarray | None = None,
+    map_side: int = 0,
 ) -> kernels.Vpls:
     """Lights made of `count` photons, in their order.
 
     Args:
         scene: in which the photons are.
-        photons: with the fields of a source that was told `sharpest`.
+        photons: of a source that was told how sharp lobes may be, for what lights need.
         count: of them.
-        sharpest: Blinn exponent of the glossy lobes that light comes from.
-        flux_scale: factor on each photon's flux, shape (count,); None: 1.
+        map_side: texels of a side of their shadow maps; 0: none are made.
+
+    Raises:
+        ValueError: the maps do not fit into the device's memory limit.
     """
     device = scene.device
     plain = is_plain(scene)
     vpls = _allocate(device, count, plain)
-    scale = np.zeros(0, np.float32) if flux_scale is None else flux_scale.astype(np.float32)
-    inputs = [scene.struct, photons, sharpest, 0, device.array(scale, float)]
+    inputs = [scene.struct, photons]
     device.launch(kernels.light_up, count, inputs, [vpls])
+    texels = count * map_side**2
+    if 4 * texels > device.memory_limit or texels >= 2**31:
+        raise ValueError(f"shadow_map is {map_side}, expected less: {count} maps take {4 * texels} bytes")
+    vpls.map_side, vpls.depth = map_side, device.zeros(texels, float)
+    device.launch(kernels.render_maps, texels, [scene.struct], [vpls])
     return vpls
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 import warpgi as gi
@@ -28,13 +30,14 @@ def blotches(device: gi.Device) -> Value:
     return mean_value(values)
 
 
-def _edge(edge_rays: int, photons: int, device: gi.Device) -> Value:
+def _edge(edge_rays: int, photons: int, device: gi.Device, corner: bool = False) -> Value:
     values = []
     for seed in range(4):
         image, position = _room(gi.PhotonMap(photons=photons, spp=4, edge_rays=edge_rays), device, seed)
-        # the wall is at 1 in one coordinate; how near is the next to it?
-        second = np.sort(np.abs(position), axis=2)[..., 1]
-        values.append(float(1.0 - image[second > 0.95].mean() / image[second < 0.8].mean()))
+        # the wall is at 1 in one coordinate; how near are the others to it?
+        least, second, _ = np.moveaxis(np.sort(np.abs(position), axis=2), 2, 0)
+        near = least > 0.9 if corner else second > 0.95
+        values.append(float(1.0 - image[near].mean() / image[second < 0.8].mean()))
     return mean_value(values)
 
 
@@ -46,6 +49,17 @@ def dark_edges(device: gi.Device) -> Value:
 def corrected_edges(device: gi.Device) -> Value:
     """The same with it, of either sign."""
     value = _edge(8, 50_000, device)
+    return Value(abs(value.value), value.error)
+
+
+def dark_corners(device: gi.Device) -> Value:
+    """What is missing in corners of an evenly lit room without the correction."""
+    return _edge(0, 50_000, device, corner=True)
+
+
+def corrected_corners(device: gi.Device) -> Value:
+    """The same with it, of either sign."""
+    value = _edge(8, 50_000, device, corner=True)
     return Value(abs(value.value), value.error)
 
 
@@ -70,16 +84,32 @@ def leak_gathered(device: gi.Device) -> Value:
     return _leak(gi.PhotonMap(spp=4, final_gather=8), device)
 
 
+def leak_any_normal(device: gi.Device) -> Value:
+    """The same where photons of any normal are taken."""
+    return _leak(gi.PhotonMap(spp=4, normal_angle=180.0), device)
+
+
+def leak_any_plane(device: gi.Device) -> Value:
+    """The same where photons off the plane are taken."""
+    return _leak(gi.PhotonMap(spp=4, flatten=1.0), device)
+
+
 def leak_taking_all(device: gi.Device) -> Value:
     """The same where photons of any normal and plane are taken."""
     return _leak(gi.PhotonMap(spp=4, normal_angle=180.0, flatten=1.0), device)
 
 
-def _blur(neighbours: int, device: gi.Device) -> Value:
-    """relMSE inside the ring, against forty times the photons and a tenth of the area."""
+@lru_cache(maxsize=1)
+def _fine_caustic(device: gi.Device) -> tuple[gi.Scene, gi.Render]:
+    """A small lamp's caustic, by a hundred times the photons of what is judged and a tenth of the area."""
     scene = gi.scenes.caustic(lamp_radius=0.01)
     fine = gi.PhotonMap(spp=64, map_spp=4, caustic_photons=200_000, caustic_neighbours=20)
-    truth = gi.render(scene, fine, SIZE, 99, device)
+    return scene, gi.render(scene, fine, SIZE, 99, device)
+
+
+def _blur(neighbours: int, device: gi.Device) -> Value:
+    """relMSE inside the ring."""
+    scene, truth = _fine_caustic(device)
     inside = inside_ring(scene, truth)
     values = []
     for seed in range(4):
@@ -106,6 +136,11 @@ def blurred_caustic(device: gi.Device) -> Value:
     return _blur(200, device)
 
 
+def caustic_by_default(device: gi.Device) -> Value:
+    """k = 50, as it is unless told otherwise."""
+    return _blur(50, device)
+
+
 def blotchy_caustic(device: gi.Device) -> Value:
     """k = 10: they are sharp, and rough."""
     return _blur(10, device)
@@ -115,10 +150,15 @@ ROWS = (
     Failure("photon-map", "furnace", "scatter of even light over 8 x 8 pixels, 20 000 paths", None, blotches),
     Failure("photon-map", "furnace", "light missing along edges, no correction", None, dark_edges),
     Failure("photon-map", "furnace", "light wrong along edges, corrected", 0.04, corrected_edges),
+    Failure("photon-map", "furnace", "light missing in corners, no correction", None, dark_corners),
+    Failure("photon-map", "furnace", "light wrong in corners, corrected", 0.1, corrected_corners),
     Failure("photon-map", "leak", "light of the dark room over the lit one's", 0.03, leak),
     Failure("photon-map", "leak", "the same by final gathering", 0.03, leak_gathered),
+    Failure("photon-map", "leak", "the same, photons of any normal taken", None, leak_any_normal),
+    Failure("photon-map", "leak", "the same, photons off the plane taken", None, leak_any_plane),
     Failure("photon-map", "leak", "the same, all normals and planes taken", None, leak_taking_all),
     Failure("photon-map", "caustic", "relMSE inside the ring, small lamp, k = 10", None, blotchy_caustic),
+    Failure("photon-map", "caustic", "relMSE inside the ring, small lamp, k = 50", None, caustic_by_default),
     Failure("photon-map", "caustic", "relMSE inside the ring, small lamp, k = 200", None, blurred_caustic),
     Failure("photon-map", "caustic", "share of pixels that stand out, 16 gather rays", None, gathered_dots),
 )

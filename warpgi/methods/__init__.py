@@ -13,6 +13,7 @@ from warpgi.methods.instant_radiosity import InstantRadiosity, NearLight
 from warpgi.methods.irradiance_cache import IrradianceCache
 from warpgi.methods.irradiance_filter import IrradianceFilter
 from warpgi.methods.light_field import LightField
+from warpgi.methods.meshless_hierarchy import MeshlessHierarchy
 from warpgi.methods.path import PathTracing, Sampler
 from warpgi.methods.photon_map import Kernel, PhotonMap
 from warpgi.methods.random_parameter_filter import RandomParameterFilter
@@ -80,6 +81,7 @@ METHODS: dict[str, type] = {
     "photon-map": PhotonMap,
     "instant-radiosity": InstantRadiosity,
     "temporal-light-field": TemporalLightField,
+    "meshless-hierarchy": MeshlessHierarchy,
 }
 
 #: Methods of whole sequences, which `render_animation` takes and `render` does not.
@@ -102,6 +104,7 @@ __all__ = [
     "IrradianceFilter",
     "Kernel",
     "LightField",
+    "MeshlessHierarchy",
     "Method",
     "NearLight",
     "PathTracing",

@@ -79,6 +79,9 @@ class InstantRadiosity:
     """Distance [scene units] at which two surfaces that face each other reach the bound of the geometry term, or the
     radius of spherical lights, above 0; None: in proportion to the disc that is one path's share of the scene's
     surface. More takes more light away from the virtual lights."""
+    shadow_map: int = 0
+    """Texels along a side of a shadow map over each light's hemisphere, 4 bytes each, up to 4096: shadows are off by
+    about a texel, and pictures of many pixels in large scenes faster. 0: a shadow ray from each hit to each light."""
     min_roughness: float = 0.05
     """Rough metal and coats of this roughness or more are lit by virtual lights and become some; smoother ones are
     followed by rays, in (0, 1]."""
@@ -106,6 +109,7 @@ class InstantRadiosity:
             raise TypeError(f"near_light is {self.near_light!r}, expected a NearLight")
         if self.near_distance is not None:
             checks.number("near_distance", self.near_distance, 0.0, open_lower=True)
+        checks.count("shadow_map", self.shadow_map, 0, 4096)
         checks.number("min_roughness", self.min_roughness, 0.0, 1.0, open_lower=True)
         if not isinstance(self.sampler, Sampler):
             raise TypeError(f"sampler is {self.sampler!r}, expected a Sampler")
@@ -131,7 +135,8 @@ class InstantRadiosity:
 
     def device_bytes(self, size: tuple[int, int]) -> int:
         """Device memory it takes beside scene and film, as far as it can be known."""
-        return BATCH_BYTES + LIGHTS_PER_PATH * self.paths * (PHOTON_BYTES + VPL_BYTES)
+        light_bytes = PHOTON_BYTES + VPL_BYTES + 4 * self.shadow_map**2
+        return BATCH_BYTES + LIGHTS_PER_PATH * self.paths * light_bytes
 
     def prepare(self, job: Job, film: Film) -> Lighting:
         """The set of lights that comes next."""
@@ -233,7 +238,7 @@ class Lighting:
         self._light(self.kept.shoot(self.source), self.kept.made)
 
     def _light(self, shot: Shot, made: int) -> None:
-        self.vpls = make_vpls(self.job.scene, shot.photons, shot.count, self.joining.sharpest)
+        self.vpls = make_vpls(self.job.scene, shot.photons, shot.count, self.settings.shadow_map)
         self._shot = shot  # structs do not keep their arrays alive
         self.counts["vpl_sets"] += 1
         self.counts["vpl_paths"] += made
