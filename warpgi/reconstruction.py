@@ -169,14 +169,6 @@ class Reconstruction:
         result[self.primary] = self._gathered.inverse_distance.numpy() / np.maximum(known, 1)
         return result
 
-    def irradiance_at(self, hits: np.ndarray, rays: int) -> wp.array:
-        """Irradiance at some of the primary hits, by number, from `rays` rays each, vec3 on the device."""
-        receivers = self._make_receivers(hits, self._receiver_origins, self._receiver_normals, self._per_pixel)
-        gathered = self._make_gathered(len(hits))
-        self._trace(receivers, gathered, len(hits), 0, rays, rays)
-        known = rays - gathered.counts.numpy()[:, 0]
-        return self.device.array(np.pi * gathered.radiance.numpy() / np.maximum(known, 1)[:, None], wp.vec3)
-
     def near(self) -> np.ndarray:
         """Share of each sample's rays that met a surface within reach, shape (N,); 0 without a primary hit."""
         result = np.zeros(len(self.samples), np.float32)
