@@ -46,8 +46,8 @@ LADDERS: dict[str, tuple[Settings, ...]] = {
     "random-parameter-filter": powers(16),
     "irradiance-filter": powers(64),
     "meshless-hierarchy": tuple(
-        {"spp": spp, "rays": rays, "error": error, "primary_hits": max(4, spp)}
-        for spp, rays, error in ((1, 64, 0.5), (2, 64, 0.4), (4, 128, 0.4), (8, 256, 0.4), (16, 512, 0.3))
+        {"spp": spp, "rays": rays, "tolerance": tolerance, "primary_hits": max(4, spp)}
+        for spp, rays, tolerance in ((1, 64, 0.5), (2, 64, 0.4), (4, 128, 0.4), (8, 256, 0.4), (16, 512, 0.3))
     ),
 }
 

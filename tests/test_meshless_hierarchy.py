@@ -196,7 +196,7 @@ def test_furnace():
 def test_tolerance_zero_is_the_per_pixel_reconstruction():
     """At tolerance 0 every hit is a point in the end: the picture is that of as many rays at every hit."""
     scene, size = gi.scenes.cornell_box(), (14, 14)
-    method = gi.MeshlessHierarchy(spp=2, rays=32, error=0.0, levels=16, light_samples=2)
+    method = gi.MeshlessHierarchy(spp=2, rays=32, tolerance=0.0, levels=16, light_samples=2)
     ours = gi.render(scene, method, size=size)
     theirs = gi.render(scene, gi.LightField(spp=2, rays=64, light_samples=2), size=size)
     np.testing.assert_allclose(ours.layers["indirect"], theirs.layers["indirect"], atol=1e-4, rtol=1e-3)
@@ -217,7 +217,7 @@ def test_fewer_rays_than_one_set_per_pixel():
     """With less than half of the rays, less error than a whole set of them at every pixel."""
     scene, size = gi.scenes.cornell_box(), (64, 64)
     truth = gi.render(scene, gi.PathTracing(spp=256), size=size, seed=9).layers["indirect"]
-    ours = gi.render(scene, gi.MeshlessHierarchy(spp=4, rays=64, error=0.5, light_samples=4), size=size)
+    ours = gi.render(scene, gi.MeshlessHierarchy(spp=4, rays=64, tolerance=0.5, light_samples=4), size=size)
     theirs = gi.render(scene, gi.LightField(spp=4, rays=64, light_samples=4), size=size)
     assert ours.counts["reconstruction_rays"] < 0.5 * theirs.counts["reconstruction_rays"]
     errors = [gi.compare(r.layers["indirect"], truth)["relmse"] for r in (ours, theirs)]
@@ -227,7 +227,7 @@ def test_fewer_rays_than_one_set_per_pixel():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"error": -0.1}, "error is -0.1"),
+        ({"tolerance": -0.1}, "tolerance is -0.1"),
         ({"rays": 0}, "rays is 0"),
         ({"radius": 0.0}, "radius is 0"),
         ({"levels": 17}, "levels is 17"),

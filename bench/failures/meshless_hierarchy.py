@@ -44,7 +44,7 @@ def splotches(device: gi.Device) -> Value:
     truth = make_reference(scene, SIZE, 1024, device=device).image.astype(np.float64)
     values = []
     for seed in range(1, 5):
-        render = gi.render(scene, gi.MeshlessHierarchy(spp=4, rays=64, error=0.4), SIZE, seed, device)
+        render = gi.render(scene, gi.MeshlessHierarchy(spp=4, rays=64, tolerance=0.4), SIZE, seed, device)
         rays = max(4, round(render.counts["point_rays"] / (SIZE[0] * SIZE[1])))
         per_pixel = indirect(scene, gi.LightField(spp=4, rays=rays), SIZE, seed, device)
         ours = render.layers["indirect"].astype(np.float64)

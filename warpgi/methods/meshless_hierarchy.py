@@ -35,7 +35,7 @@ class MeshlessHierarchy(SampleFilter):
         TypeError, ValueError: a setting is out of range.
     """
 
-    error: float = 0.2
+    tolerance: float = 0.2
     """Coefficient, relative to irradiance, below which nothing finer is computed around a point, 0 or above; points and
     time grow as it falls, and far more so once it is below a few times the noise of a point's rays."""
     rays: int = 256
@@ -49,7 +49,7 @@ class MeshlessHierarchy(SampleFilter):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.number("error", self.error, 0.0)
+        checks.number("tolerance", self.tolerance, 0.0)
         checks.count("rays", self.rays)
         checks.number("radius", self.radius, 0.0, 1.0, open_lower=True)
         checks.count("levels", self.levels, 1, 16)
@@ -106,7 +106,9 @@ class MeshlessFiltering:
         self.light = Reconstruction(samples, device, LightField().preprocessing, seed, hits)
         seen = hits.origin[self.light.primary]
         extent = float(np.ptp(seen, axis=0).max()) if len(seen) else 1.0
-        refinement = Refinement(max(settings.radius * extent, 1e-30), settings.levels, settings.error, settings.rays)
+        refinement = Refinement(
+            max(settings.radius * extent, 1e-30), settings.levels, settings.tolerance, settings.rays
+        )
         self.hierarchy = Hierarchy(hits, SplatSource(self.light), device, refinement, seed)
 
     def gather(self, first: int, count: int, total: int) -> None:
