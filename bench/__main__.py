@@ -7,7 +7,7 @@ from pathlib import Path
 
 import tyro
 
-from bench import animations, chart, figures, rays, reconstruction, stability
+from bench import animations, cache_figure, chart, figures, rays, reconstruction, stability
 
 BROKEN = 1  # exit status for a method that is worse than its bound
 MISUSE = 2  # exit status for a caller's mistake
@@ -89,6 +89,23 @@ def figures_command(
         device: cpu, cuda, cuda:0, ...; a GPU if there is one.
     """
     figures.run(figure, out, size, quick, device, picture, fresh)
+
+
+def cache_command(
+    out: Path,
+    size: tuple[int, int] = (256, 256),
+    reference_spp: int = 1024,
+    device: str | None = None,
+) -> None:
+    """Picture of irradiance caches beside their reference, and of where their records are.
+
+    Args:
+        out: PNG to write.
+        size: Width and height in pixels of each part.
+        reference_spp: Paths per pixel of the reference.
+        device: cpu, cuda, cuda:0, ...; a GPU if there is one.
+    """
+    cache_figure.draw(out, size, reference_spp, device)
 
 
 def animation_command(
@@ -179,6 +196,7 @@ def main(arguments: list[str] | None = None) -> int:
     app.command(rays_command, name="rays")
     app.command(figures_command, name="figures")
     app.command(scaling_command, name="scaling")
+    app.command(cache_command, name="cache")
     app.command(animation_command, name="animation")
     app.command(chart_command, name="chart")
     app.command(stability_command, name="stability")

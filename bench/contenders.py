@@ -38,6 +38,10 @@ LADDERS: dict[str, tuple[Settings, ...]] = {
         )
     ),
     "instant-radiosity": tuple({"paths": paths} for paths in (10, 32, 64, 256, 1024)),
+    "irradiance-cache": tuple(
+        {"rays": rays, "tolerance": tolerance, "light_samples": 8}
+        for rays, tolerance in ((64, 0.5), (256, 0.4), (1024, 0.3), (4096, 0.3), (4096, 0.2))
+    ),
     "a-trous": powers(64),
     "random-parameter-filter": powers(16),
     "irradiance-filter": powers(64),
@@ -47,22 +51,38 @@ LADDERS: dict[str, tuple[Settings, ...]] = {
     ),
 }
 
+#: The same with an irradiance cache: samples, primary hits and rays per pixel, and rays of a record.
+CACHED_LIGHT_FIELD: tuple[Settings, ...] = tuple(
+    {"spp": spp, "primary_hits": hits, "light_samples": hits, "rays": rays, "record_rays": record, "cache": True}
+    | {"recursive": 1, "recursive_rays": 4, "tolerance": 0.3}
+    for spp, hits, rays, record in (
+        (1, 2, 16, 64),
+        (1, 4, 32, 128),
+        (1, 8, 64, 256),
+        (1, 8, 64, 1024),
+        (2, 8, 128, 1024),
+        (4, 16, 256, 2048),
+    )
+)
+
 #: Methods without an indirect layer, and why.
 NO_LIGHT = {
     "ambient-occlusion": "its picture is occlusion, not light",
     "temporal-light-field": "it reconstructs the whole picture, not its indirect light",
 }
 
-#: Name -> maker of a contender that needs more than the library; an ImportError or ValueError says what is missing.
+#: Name -> maker of a contender that needs more than the library, or is a second line of one of its methods; an
+#: ImportError or ValueError says what is missing.
 PEERS: dict[str, Callable[[], Contender]] = {
     "mitsuba scalar_rgb": lambda: mitsuba("scalar_rgb"),
     "mitsuba llvm_ad_rgb": lambda: mitsuba("llvm_ad_rgb"),
     "oidn": oidn,
+    "light-field cache": lambda: own("light-field", CACHED_LIGHT_FIELD, "light-field cache"),
 }
 
 
-def own(name: str, ladder: tuple[Settings, ...]) -> Contender:
-    """A method of the library."""
+def own(name: str, ladder: tuple[Settings, ...], called: str | None = None) -> Contender:
+    """A method of the library, under its name or another."""
     kind = gi.METHODS[name]
     fields = {field.name for field in dataclasses.fields(kind)}
 
@@ -78,7 +98,7 @@ def own(name: str, ladder: tuple[Settings, ...]) -> Contender:
 
         return run
 
-    return Contender(name, ladder, load, sources())
+    return Contender(called or name, ladder, load, sources())
 
 
 @cache

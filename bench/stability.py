@@ -15,6 +15,7 @@ from bench.chart_page import PAGE, RESULTS, STABILITY, write_page
 from bench.failures import (
     ambient_occlusion,
     instant_radiosity,
+    irradiance_cache,
     light_field,
     meshless_hierarchy,
     path,
@@ -32,6 +33,7 @@ FAILURES: tuple[Failure, ...] = (
     *meshless_hierarchy.ROWS,
     *ambient_occlusion.ROWS,
     *photon_map.ROWS,
+    *irradiance_cache.ROWS,
     *instant_radiosity.ROWS,
     *statistical_filter.ROWS,
 )

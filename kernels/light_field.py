@@ -3,8 +3,9 @@
 import warp as wp
 
 from warpgi.kernels.film import Film
+from warpgi.kernels.hemisphere import Hemispheres, stratum_direction
 from warpgi.kernels.rng import SOBOL, SOBOL_PAIRS, make_sampler, sample_2d
-from warpgi.kernels.sampling import make_frame, square_to_cosine_hemisphere, to_world
+from warpgi.kernels.sampling import PI, make_frame, square_to_cosine_hemisphere, to_world
 from warpgi.kernels.splats import (
     SplatTree,
     first_surface,
@@ -134,6 +135,52 @@ class Gathered:
     counts: wp.array[wp.vec4i]  # rays without support, to the sky, cut short; undersampled surfaces passed through
 
 
+@wp.struct
+class Incident:
+    """What one reconstruction ray finds."""
+
+    radiance: wp.vec3
+    distance: float  # of the surface, FAR: the sky, below 0: nothing is known there
+    near: float  # share of the surface within reach
+    counts: wp.vec4i  # as in Gathered
+
+
+@wp.func
+def incident(
+    tree: SplatTree,
+    sky: Sky,
+    o: wp.vec3,
+    d: wp.vec3,
+    noise: float,
+    reach: float,
+    keep_one: float,
+    keep_two: float,
+):
+    result = Incident()
+    s = first_surface(tree, o, d, noise, reach, keep_one, keep_two)
+    splat = int(-1)
+    if s[8] > 0.0:
+        splat = nearest_facing(tree, o + s[8] * d, d)
+    if splat >= 0:
+        # what faces away belongs to the other side of something thin, whose light may be quite another
+        result.radiance = splat_radiance(tree, splat)
+    elif s[3] > 0.0:
+        result.radiance = wp.vec3(s[0], s[1], s[2]) / s[3]
+    elif sky.size > 0:
+        result.radiance = sky_radiance(sky, d)
+        result.counts[1] = 1
+    else:
+        result.counts[0] = 1
+    if splat >= 0 or s[3] > 0.0:
+        result.distance = s[9] / s[3]
+        result.near = s[4] / s[3]
+    else:
+        result.distance = wp.where(sky.size > 0, FAR, -1.0)
+    result.counts[2] = int(s[6])
+    result.counts[3] = int(s[7])
+    return result
+
+
 @wp.kernel
 def reconstruct(
     offset: int,
@@ -171,26 +218,12 @@ def reconstruct(
         # one sequence a pixel, cut into the shares of its samples
         sampler = make_sampler(seed, pixel, place * rays_each + ray, SOBOL)
         d = to_world(frame, square_to_cosine_hemisphere(sample_2d(sampler, GATHER_PAIR)))
-        s = first_surface(tree, o, d, noise, reach, keep_one, keep_two)
-        splat = int(-1)
-        if s[8] > 0.0:
-            splat = nearest_facing(tree, o + s[8] * d, d)
-        if splat >= 0:
-            # what faces away belongs to the other side of something thin, whose light may be quite another
-            total = total + splat_radiance(tree, splat)
-            near = near + s[4] / s[3]
-        elif s[3] > 0.0:
-            total = total + wp.vec3(s[0], s[1], s[2]) / s[3]
-            near = near + s[4] / s[3]
-        elif sky.size > 0:
-            total = total + sky_radiance(sky, d)
-            counts[1] = counts[1] + 1
-        else:
-            counts[0] = counts[0] + 1
-        if s[3] > 0.0:
-            inverse = inverse + s[3] / wp.max(s[9], 1.0e-20)
-        counts[2] = counts[2] + int(s[6])
-        counts[3] = counts[3] + int(s[7])
+        found = incident(tree, sky, o, d, noise, reach, keep_one, keep_two)
+        total = total + found.radiance
+        near = near + found.near
+        counts = counts + found.counts
+        if found.distance > 0.0 and found.distance < FAR:
+            inverse = inverse + 1.0 / found.distance
     gathered.radiance[i] = total
     gathered.near[i] = near
     if gathered.inverse_distance.shape[0] > 0:
@@ -198,10 +231,43 @@ def reconstruct(
     gathered.counts[i] = counts
 
 
+@wp.kernel
+def reconstruct_strata(
+    offset: int,
+    tree: SplatTree,
+    sky: Sky,
+    hemispheres: Hemispheres,
+    seed: int,
+    noise: float,
+    keep_one: float,
+    keep_two: float,
+    strata: wp.array[wp.vec4],
+    counts: wp.array[wp.vec4i],
+):
+    """One thread owns a point and fills the strata of its hemisphere by reconstruction rays: radiance and distance."""
+    i = offset + wp.tid()
+    frame = make_frame(hemispheres.normals[i])
+    size = hemispheres.rings * hemispheres.sectors
+    total = wp.vec4i(0)
+    for k in range(size):
+        d = to_world(frame, stratum_direction(hemispheres, i, k, seed))
+        found = incident(tree, sky, hemispheres.points[i], d, noise, FAR, keep_one, keep_two)
+        strata[i * size + k] = wp.vec4(found.radiance[0], found.radiance[1], found.radiance[2], found.distance)
+        total = total + found.counts
+    counts[i] = total
+
+
 @wp.func
 def mean_radiance(gathered: Gathered, i: int, ray_count: int):
     """Mean over the rays that found support or the sky."""
     return gathered.radiance[i] / float(wp.max(ray_count - gathered.counts[i][0], 1))
+
+
+@wp.kernel
+def gathered_irradiance(offset: int, gathered: Gathered, ray_count: int, irradiance: wp.array[wp.vec3]):
+    """One thread writes one receiver's irradiance: pi times the mean, as rays follow the cosine."""
+    i = offset + wp.tid()
+    irradiance[i] = mean_radiance(gathered, i, ray_count) * PI
 
 
 @wp.kernel

@@ -87,7 +87,7 @@ def test_exr_channels_have_the_names_that_other_tools_read(tmp_path):
     render = full_render()
     render.save(tmp_path / "a.exr")
     channels, header = raw(tmp_path / "a.exr")
-    names = ["R", "G", "B", "depth.Z", "hit_distance.Z"]
+    names = ["R", "G", "B", "depth.Z", "hit_distance.Z", "records.Z"]
     names += [f"{layer}.{c}" for layer in ("emission", "direct", "indirect", "albedo", "variance") for c in "RGB"]
     names += [f"{layer}.{c}" for layer in ("normal", "position") for c in "XYZ"]
     assert sorted(channels) == sorted(names)

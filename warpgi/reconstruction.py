@@ -14,6 +14,7 @@ import warp as wp
 from warpgi.device import Device
 from warpgi.kernels import bvh
 from warpgi.kernels import light_field as kernels
+from warpgi.kernels.hemisphere import Hemispheres
 from warpgi.samples import NO_HIT, SampleBuffer
 from warpgi.splat_tree import SplatTree
 
@@ -120,6 +121,7 @@ class Reconstruction:
             self._relight(splats, recursive_rays)
         per_pixel = self._per_pixel = samples.spp if hits is None else hits.per_pixel
         self._receivers = self._make_receivers(self.primary, self._receiver_origins, self._receiver_normals, per_pixel)
+        self._found = np.zeros(4, np.int64)  # beside what `_gathered` counts
         self._gathered = self._make_gathered(len(self.primary))
         self._gathered.inverse_distance = device.zeros(len(self.primary) if with_distance else 0, float)
         self.rays_done = 0
@@ -136,6 +138,23 @@ class Reconstruction:
         self.device.launch(kernels.reflect, len(self.primary), inputs, [result])
         return result
 
+    def fill_strata(self, hemispheres: Hemispheres, strata: wp.array, count: int) -> None:
+        """Sends a ray into each stratum of `count` hemispheres, whose points are relative to `centre`."""
+        counts = self.device.zeros(count, wp.vec4i)
+        self._send(hemispheres, count, [strata, counts])
+        self.counts["reconstruction_rays"] += len(strata)
+        self._found += counts.numpy().sum(axis=0, dtype=np.int64)
+
+    def irradiance_at(self, hits: np.ndarray, rays: int) -> wp.array:
+        """Irradiance at some of the primary hits from `rays` rays each, vec3 on the device."""
+        receivers = self._make_receivers(hits, self._receiver_origins, self._receiver_normals, self._per_pixel)
+        gathered = self._make_gathered(len(hits))
+        self._trace(receivers, gathered, len(hits), 0, rays, rays)
+        result = self.device.zeros(len(hits), wp.vec3)
+        self.device.launch(kernels.gathered_irradiance, len(hits), [gathered, rays], [result])
+        self._found += gathered.counts.numpy().sum(axis=0, dtype=np.int64)
+        return result
+
     def incident(self) -> np.ndarray:
         """Light that falls on each primary hit, irradiance over pi, shape (M, 3); 0 for rows without one."""
         result = np.zeros((self._receiver_albedo.size, 3), np.float32)
@@ -150,14 +169,6 @@ class Reconstruction:
         result[self.primary] = self._gathered.inverse_distance.numpy() / np.maximum(known, 1)
         return result
 
-    def irradiance_at(self, hits: np.ndarray, rays: int) -> wp.array:
-        """Irradiance at some of the primary hits, by number, from `rays` rays each, vec3 on the device."""
-        receivers = self._make_receivers(hits, self._receiver_origins, self._receiver_normals, self._per_pixel)
-        gathered = self._make_gathered(len(hits))
-        self._trace(receivers, gathered, len(hits), 0, rays, rays)
-        known = rays - gathered.counts.numpy()[:, 0]
-        return self.device.array(np.pi * gathered.radiance.numpy() / np.maximum(known, 1)[:, None], wp.vec3)
-
     def near(self) -> np.ndarray:
         """Share of each sample's rays that met a surface within reach, shape (N,); 0 without a primary hit."""
         result = np.zeros(len(self.samples), np.float32)
@@ -167,16 +178,29 @@ class Reconstruction:
 
     def all_counts(self) -> dict[str, int]:
         """Rays so far, and what was dropped, cut short or without support."""
-        found = self._gathered.counts.numpy().sum(axis=0, dtype=np.int64)
+        found = self._found + self._gathered.counts.numpy().sum(axis=0, dtype=np.int64)
         names = ("missing_support", "sky_rays", "cut_gathers", "undersampled_surfaces")
         return self.counts | dict(zip(names, found.tolist(), strict=True))
+
+    def _middle(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """The origin of positions, by the splats' bounds."""
+        return 0.5 * (low + high)
+
+    def _fit(self) -> None:
+        """Makes splats ready for rays, once they are sized."""
+        if self.preprocessing.shrink:
+            self.tree.shrink(self.rays, self.preprocessing.margin, self.escaped, self.extent)
+
+    def _send(self, hemispheres: Hemispheres, count: int, outputs: list[wp.array]) -> None:
+        inputs = [self.tree.struct, self.sky, hemispheres, self.seed, self.noise, *self._kept_parts()]
+        self.device.launch(kernels.reconstruct_strata, count, inputs, outputs)
 
     def _upload(self, splats: np.ndarray, receivers: PrimaryHits | None) -> None:
         """Positions relative to the splats' centre, so that float32 serves samples far away."""
         samples, device = self.samples, self.device
         used = samples.hit[splats] if len(splats) else np.zeros((1, 3), np.float32)
         low, high = used.min(axis=0), used.max(axis=0)
-        centre = 0.5 * (low + high)
+        self.centre = centre = self._middle(low, high)
         self.extent = float((high - low).max())  # of the splats
         self.noise = NOISE_ULPS * max(float(np.abs(low).max()), float(np.abs(high).max()), 1e-30)
         with np.errstate(invalid="ignore", over="ignore"):
@@ -199,8 +223,7 @@ class Reconstruction:
         rays.origins, rays.hits, rays.order = self._origins, self._hits, self.tree.order
         self.rays = rays
         self.tree.size_by_neighbours(rays, self.preprocessing.neighbours, self.preprocessing.alpha)
-        if self.preprocessing.shrink:
-            self.tree.shrink(rays, self.preprocessing.margin, self.escaped, self.extent)
+        self._fit()
 
     def _make_receivers(
         self, sample: np.ndarray, origins: wp.array, normals: wp.array, per_pixel: int

@@ -77,6 +77,10 @@ LAYERS: Mapping[str, Layer] = {
         "harmonic mean distance from the first hits to what the rays going on from there met [scene units]; rays that"
         " met nothing count as infinite; 0 where all did",
     ),
+    "records": Layer(
+        ("records.Z",),
+        "1 in pixels where an irradiance cache has a record, else 0",
+    ),
     "variance": Layer(
         ("variance.R", "variance.G", "variance.B"),
         "estimated variance of the pixel's mean in `image`, per channel [squared radiance]",

@@ -62,10 +62,8 @@ def trace_sample_buffer(
     The first `spp` of a pixel's `hits` primary hits send secondary rays, which make the buffer; light is to be gathered
     at all of them. `with_gloss` records glossy primary hits too, with what their BSDFs need; else only diffuse ones.
     """
-    device, scene = job.device, job.scene.scene
     pixels = job.size[0] * job.size[1]
-    arrays = SampleArrays()
-    arrays.hits, arrays.spp = hits, spp
+    scene = job.scene.scene
     of_hits: dict[str, Any] = dict.fromkeys(PRIMARY, wp.vec3)
     of_rays: dict[str, Any] = dict.fromkeys(SECONDARY, wp.vec3)
     if with_hit_light:
@@ -75,14 +73,8 @@ def trace_sample_buffer(
             of_hits, of_rays = of_hits | more_of_hits, of_rays | more_of_rays
     if scene.camera.lens_radius > 0.0:
         of_hits["lens"] = wp.vec2
-    for names, count in ((of_hits, pixels * hits), (of_rays, pixels * spp)):
-        for name, dtype in names.items():
-            setattr(arrays, name, device.zeros(count, dtype))
-    for band in film.bands:
-        arrays.first_pixel = band.start
-        settings = path_settings(job, max_depth, roulette_depth, sampler, with_gloss)
-        inputs = [job.scene.struct, job.camera, settings, light_samples]
-        device.launch(trace_samples, len(band), inputs, [film.load(band), arrays])
+    paths = path_settings(job, max_depth, roulette_depth, sampler, with_gloss)
+    arrays = _trace(job, film, hits, spp, light_samples, paths, of_hits, of_rays)
     # on cpu these are the very arrays, which the buffer keeps alive
     values = {name: getattr(arrays, name).numpy() for name in of_hits | of_rays}
     gloss = {name: values[name] for name in GLOSS[0] if with_gloss}
@@ -94,6 +86,38 @@ def trace_sample_buffer(
     if with_gloss:
         values["materials"] = tuple(shape.material for shape in scene.shapes)
     return SampleBuffer(job.size[0], job.size[1], spp, **values, **_projection(job)), every
+
+
+def trace_primary_hits(job: Job, film: Film, hits: int, light_samples: int, paths: PathSettings) -> PrimaryHits:
+    """Traces a picture's primary hits alone; positions stay relative to the device's origin. Direct light, and all
+    light of surfaces that are not diffuse, goes to the film."""
+    arrays = _trace(job, film, hits, 0, light_samples, paths, dict.fromkeys(PRIMARY, wp.vec3), {})
+    origin, normal, albedo = (getattr(arrays, name).numpy() for name in PRIMARY)
+    return PrimaryHits(origin, normal, albedo, hits)
+
+
+def _trace(
+    job: Job,
+    film: Film,
+    hits: int,
+    spp: int,
+    light_samples: int,
+    paths: PathSettings,
+    of_hits: dict[str, Any],
+    of_rays: dict[str, Any],
+) -> SampleArrays:
+    """Fills the named arrays of a picture's primary hits, and of its secondary rays."""
+    pixels = job.size[0] * job.size[1]
+    arrays = SampleArrays()
+    arrays.hits, arrays.spp = hits, spp
+    for names, count in ((of_hits, pixels * hits), (of_rays, pixels * spp)):
+        for name, dtype in names.items():
+            setattr(arrays, name, job.device.zeros(count, dtype))
+    for band in film.bands:
+        arrays.first_pixel = band.start
+        inputs = [job.scene.struct, job.camera, paths, light_samples]
+        job.device.launch(trace_samples, len(band), inputs, [film.load(band), arrays])
+    return arrays
 
 
 def trace_primary_buffer(

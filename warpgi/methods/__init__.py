@@ -10,6 +10,7 @@ from warpgi.job import Job
 from warpgi.methods.a_trous import ATrous
 from warpgi.methods.ambient_occlusion import AmbientOcclusion
 from warpgi.methods.instant_radiosity import InstantRadiosity, NearLight
+from warpgi.methods.irradiance_cache import IrradianceCache
 from warpgi.methods.irradiance_filter import IrradianceFilter
 from warpgi.methods.light_field import LightField
 from warpgi.methods.meshless_hierarchy import MeshlessHierarchy
@@ -75,6 +76,7 @@ METHODS: dict[str, type] = {
     "ambient-occlusion": AmbientOcclusion,
     "a-trous": ATrous,
     "random-parameter-filter": RandomParameterFilter,
+    "irradiance-cache": IrradianceCache,
     "irradiance-filter": IrradianceFilter,
     "photon-map": PhotonMap,
     "instant-radiosity": InstantRadiosity,
@@ -98,6 +100,7 @@ __all__ = [
     "AmbientOcclusion",
     "FrameMethod",
     "InstantRadiosity",
+    "IrradianceCache",
     "IrradianceFilter",
     "Kernel",
     "LightField",

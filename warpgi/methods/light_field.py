@@ -10,15 +10,19 @@ import numpy as np
 import warp as wp
 
 from warpgi import checks
+from warpgi.cached_reconstruction import CachedReconstruction
 from warpgi.device import Device
+from warpgi.device_scene import DeviceScene
 from warpgi.film import Film
 from warpgi.glossy_reconstruction import GlossyReconstruction
+from warpgi.irradiance import STRATA_BYTES
 from warpgi.job import Job
 from warpgi.kernels.light_field import add_reflected
 from warpgi.kernels.primary_samples import trace_primary_samples
 from warpgi.kernels.samples import trace_samples
 from warpgi.kernels.splats import MAX_NEIGHBOURS
 from warpgi.lens_reconstruction import PRIMARY_SAMPLE_BYTES, LensReconstruction
+from warpgi.methods.irradiance_cache import IrradianceCache
 from warpgi.methods.path import NEVER, Sampler, check_paths
 from warpgi.methods.photon_map import PhotonMap, light_by_photons
 from warpgi.reconstruction import (
@@ -30,10 +34,15 @@ from warpgi.reconstruction import (
     Reconstruction,
     pixel_means,
 )
+from warpgi.record_cache import BYTES_PER_HIT as CACHE_BYTES_PER_HIT
+from warpgi.record_cache import KERNELS as CACHE_KERNELS
+from warpgi.record_cache import Caching
 from warpgi.samples import SampleBuffer
 from warpgi.sampling import PRIMARY_BYTES, SECONDARY_BYTES, trace_primary_buffer, trace_sample_buffer
+from warpgi.traced_reconstruction import KERNELS as TRACED_KERNELS
+from warpgi.traced_reconstruction import TracedReconstruction
 
-AnyReconstruction = Reconstruction | LensReconstruction
+AnyReconstruction = Reconstruction | CachedReconstruction | LensReconstruction
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,6 +83,15 @@ class LightField:
     photons: int = 0
     """Paths from the lights for a photon map that gives the radiance at secondary hits in place of traced paths: free
     of noise but blurred, with caustics read at the primary hits; 0: none."""
+    cache: bool = False
+    """Gather at the records of an irradiance cache instead of every primary hit, and interpolate between them; `rays`
+    are then those of pixels where the cache would interpolate across too much, such as foliage."""
+    tolerance: float = 0.3
+    """With `cache`: error up to which a record serves, see `IrradianceCache`."""
+    scene_rays: bool = True
+    """With `cache`, and where a scene is at hand: let it stop the rays of records, and splats only light them."""
+    record_rays: int = 256
+    """With `cache`: rays of a record."""
     light_samples: int = 32
     """Shadow rays to lights per pixel, shared out over its primary hits, which make the direct light."""
     max_depth: int | None = None
@@ -98,6 +116,10 @@ class LightField:
         checks.count("recursive_rays", self.recursive_rays)
         checks.count("photons", self.photons, 0)
         checks.count("light_samples", self.light_samples)
+        checks.number("tolerance", self.tolerance, 0.0, open_lower=True)
+        checks.count("record_rays", self.record_rays)
+        if self.cache and self.primary_rays:
+            raise ValueError("cache and primary_rays are both set, expected one: a cache is for light on surfaces")
         if self.primary_hits is not None:
             checks.count("primary_hits", self.primary_hits, self.spp)
         check_paths(self.max_depth, self.roulette_depth, self.sampler)
@@ -117,12 +139,19 @@ class LightField:
         """What it launches."""
         if self.primary_rays:
             return (trace_primary_samples,)  # lens reconstruction loads its own, those for motion where it needs them
-        return (trace_samples, *KERNELS, *(PhotonMap().kernels if self.photons else ()))
+        photons = PhotonMap().kernels if self.photons else ()
+        cache = (*CACHE_KERNELS, *TRACED_KERNELS) if self.cache else ()
+        return (trace_samples, *KERNELS, *photons, *cache)
 
     @property
     def preprocessing(self) -> Preprocessing:
         """How splats are sized."""
         return Preprocessing(self.neighbours, self.alpha, self.margin, self.lone_radius)
+
+    @property
+    def caching(self) -> Caching:
+        """How records are placed."""
+        return IrradianceCache(rays=self.record_rays, tolerance=self.tolerance).caching
 
     @property
     def hits(self) -> int:
@@ -133,6 +162,8 @@ class LightField:
         """Reconstruction rays for each primary hit, at `hits` of them in a pixel, and what to call them."""
         if self.primary_rays:
             return self.rays, "rays"
+        if self.cache:
+            return len(self.caching.rounds), "levels"
         return max(1, round(self.rays / (hits or self.hits))), "rays per hit"
 
     def device_bytes(self, size: tuple[int, int]) -> int:
@@ -141,6 +172,8 @@ class LightField:
             return size[0] * size[1] * self.spp * PRIMARY_SAMPLE_BYTES
         hit, ray = PRIMARY_BYTES + BYTES_PER_HIT, SECONDARY_BYTES + BYTES_PER_SAMPLE
         photons = PhotonMap(photons=self.photons).device_bytes(size) if self.photons else 0
+        if self.cache:
+            hit, photons = hit + CACHE_BYTES_PER_HIT + PRIMARY_BYTES, photons + STRATA_BYTES
         return size[0] * size[1] * (self.hits * hit + self.spp * ray) + photons
 
     def prepare(self, job: Job, film: Film) -> AnyReconstruction:
@@ -159,27 +192,36 @@ class LightField:
             self.roulette_depth or NEVER,
             self.sampler,
             with_hit_light=self.recursive > 0,
-            with_gloss=job.scene.scene.is_glossy and not self.photons,
+            with_gloss=job.scene.scene.is_glossy and not self.photons and not self.cache,
         )
         caustics = light_by_photons(job, self.photons, samples, hits) if self.photons else None
-        state = self.reconstruction(samples, job.device, job.seed, hits)
-        if isinstance(state, Reconstruction):
+        state = self.reconstruction(samples, job.device, job.seed, hits, job.scene)
+        if not isinstance(state, LensReconstruction):
             state.caustics = caustics
         return state
 
     def reconstruction(
-        self, samples: SampleBuffer, device: Device, seed: int, hits: PrimaryHits | None = None
+        self,
+        samples: SampleBuffer,
+        device: Device,
+        seed: int,
+        hits: PrimaryHits | None = None,
+        scene: DeviceScene | None = None,
     ) -> AnyReconstruction:
         """Splats made of a sample buffer, ready for `gather`."""
         if self.primary_rays:
             return LensReconstruction(samples, device, self.preprocessing, seed)
-        bandwidth = self.bandwidth and samples.bandwidth is not None
+        bandwidth = self.bandwidth and samples.bandwidth is not None and not self.cache
         make: Any = Reconstruction
-        if samples.material is not None or bandwidth:
+        if self.cache and self.scene_rays and scene is not None:
+            make = partial(TracedReconstruction, scene)
+        elif samples.material is not None or bandwidth:
             make = partial(GlossyReconstruction, bandwidth=bandwidth)
         how = {"recursions": self.recursive, "recursive_rays": self.recursive_rays}
+        if self.cache and samples.material is not None:
+            raise ValueError("samples hold glossy surfaces, expected only diffuse ones for cache")
         state: Reconstruction = make(samples, device, self.preprocessing, seed, hits, **how)
-        return state
+        return CachedReconstruction(state, hits, self.caching, self.rays) if self.cache else state
 
     def estimate(self, job: Job, state: AnyReconstruction, film: Film, first: int, count: int) -> None:
         """Sends `count` reconstruction rays from every primary hit."""
@@ -194,13 +236,14 @@ class LightField:
             job.device.launch(add_reflected, len(band), [film.load(band), reflected, self.hits])
             if state.caustics is not None:
                 job.device.launch(add_reflected, len(band), [film.load(band), state.caustics, self.hits])
-        return {}
+        return {"records": state.records()} if isinstance(state, CachedReconstruction) else {}
 
     def layers(self, state: AnyReconstruction) -> dict[str, np.ndarray]:
         """The indirect layer of a reconstruction without a scene, or the picture seen through the lens."""
         if isinstance(state, LensReconstruction):
             return {"image": state.image()}
-        return {"indirect": pixel_means(state.samples, state.reflected().numpy())}
+        layers = {"indirect": pixel_means(state.samples, state.reflected().numpy())}
+        return layers | ({"records": state.records()} if isinstance(state, CachedReconstruction) else {})
 
     def counts(self, state: AnyReconstruction) -> dict[str, int]:
         """Reconstruction rays, and what was dropped, cut short or without support."""

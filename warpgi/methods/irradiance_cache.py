@@ -1,0 +1,141 @@
+"""Irradiance caching (Ward, Rubinstein, Clear 1988): indirect light where it is needed, interpolated elsewhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+from warpgi import checks
+from warpgi.film import Film
+from warpgi.irradiance import STRATA_BYTES, PathSource
+from warpgi.job import Job
+from warpgi.kernels.light_field import add_reflected
+from warpgi.kernels.path_strata import trace_strata
+from warpgi.kernels.samples import trace_samples
+from warpgi.methods.path import NEVER, Sampler, check_paths
+from warpgi.record_cache import BYTES_PER_HIT, COARSEST, KERNELS, Caching, RecordCache
+from warpgi.records import Records
+from warpgi.sampling import PRIMARY_BYTES, path_settings, trace_primary_hits
+
+
+@dataclass(frozen=True, kw_only=True)
+class IrradianceCache:
+    """Irradiance caching (Ward, Rubinstein, Clear 1988): indirect light at a few points, interpolated between them.
+
+    Records lie where surfaces are seen and none is near enough, found on grids of pixels from coarse to fine; each is
+    traced with many paths, which also tell how far it can be trusted and how its light changes (Ward, Heckbert 1992).
+    Diffuse surfaces are cached, also behind mirrors and glass; others keep light that is path-traced from each pixel.
+
+    Raises:
+        TypeError, ValueError: a setting is out of range.
+    """
+
+    spp: int = 8
+    """Primary hits per pixel, a camera ray each, which make edges and textures."""
+    tolerance: float = 0.3
+    """Error up to which a record serves, a of Ward et al.: distance over its radius, plus turn of the normal; above 0,
+    and below 1 in earnest. Records, and time, grow about with its inverse square."""
+    rays: int = 1024
+    """Paths of a record, one to a stratum of its hemisphere; with fewer, noise becomes splotches."""
+    overlap: float = 1.5
+    """Interpolation takes records of up to so many times the tolerance, 1 or above; more is smoother and blurs more."""
+    spread: float = 0.25
+    """One more record is made where those at hand disagree by this relative standard deviation, above 0."""
+    min_radius: float = 4.0
+    """Least radius of a record [pixels], 0 or above."""
+    max_radius: float = 100.0
+    """Largest radius of a record [pixels], `min_radius` or above."""
+    finest: int = 4
+    """Pixels from one place for a record to the next on the finest grid: a power of 2 up to 32."""
+    gradients: bool = True
+    """Extrapolate records by their gradients."""
+    fallback_rays: int = 64
+    """Paths per pixel where no record serves, such as in foliage."""
+    light_samples: int = 32
+    """Shadow rays to lights per pixel, shared out over its primary hits, which make the direct light."""
+    max_depth: int | None = None
+    """Longest path in segments, mirrors before a cached surface not counted; None is unlimited."""
+    roulette_depth: int | None = 5
+    """Segments after which Russian roulette may end a path; None switches it off and needs a `max_depth`."""
+    sampler: Sampler = Sampler.SOBOL
+    """Where the paths' random numbers come from."""
+    records: str | None = None
+    """File of records (.npz) to begin with where it is there, and in which all are kept in the end: for another view
+    of the same scene, or more pixels."""
+
+    def __post_init__(self) -> None:
+        for name in ("spp", "rays", "fallback_rays", "light_samples"):
+            checks.count(name, getattr(self, name))
+        for name in ("tolerance", "spread"):
+            checks.number(name, getattr(self, name), 0.0, open_lower=True)
+        checks.number("overlap", self.overlap, 1.0)
+        checks.number("min_radius", self.min_radius, 0.0)
+        checks.number("max_radius", self.max_radius, self.min_radius)
+        checks.count("finest", self.finest, 1, COARSEST)
+        if self.finest & (self.finest - 1):
+            raise ValueError(f"finest is {self.finest}, expected a power of 2")
+        if self.records is not None and not isinstance(self.records, str):
+            raise TypeError(f"records is {type(self.records).__name__}, expected the name of a file")
+        check_paths(self.max_depth, self.roulette_depth, self.sampler)
+
+    @property
+    def needs_light(self) -> bool:
+        """Whether the picture of a scene without light is black."""
+        return True
+
+    @property
+    def kernels(self) -> tuple[wp.Kernel, ...]:
+        """What it launches: a kernel of each module."""
+        return (trace_samples, trace_strata, add_reflected, *KERNELS)
+
+    @property
+    def caching(self) -> Caching:
+        """How records are placed and used."""
+        return Caching(
+            tolerance=self.tolerance,
+            rays=self.rays,
+            overlap=self.overlap,
+            spread=self.spread,
+            smallest=self.min_radius,
+            largest=self.max_radius,
+            finest=self.finest,
+            gradients=self.gradients,
+        )
+
+    def passes(self) -> tuple[int, str]:
+        """Grids of pixels that are looked at."""
+        return len(self.caching.rounds), "grids"
+
+    def device_bytes(self, size: tuple[int, int]) -> int:
+        """Device memory it takes beside scene and film."""
+        return size[0] * size[1] * self.spp * (2 * PRIMARY_BYTES + BYTES_PER_HIT) + STRATA_BYTES
+
+    def prepare(self, job: Job, film: Film) -> RecordCache:
+        """Traces the primary hits, with all light that is not cached going to the film."""
+        known = None
+        if self.records is not None and Path(self.records).exists():
+            known = Records.load(self.records).moved(-job.scene.centre)
+        paths = path_settings(job, self.max_depth or NEVER, self.roulette_depth or NEVER, self.sampler)
+        hits = trace_primary_hits(job, film, self.spp, max(1, self.light_samples // self.spp), paths)
+        rest = path_settings(job, (self.max_depth or NEVER) - 1, self.roulette_depth or NEVER, self.sampler)
+        return RecordCache(job.device, hits, job.size, PathSource(job, hits, rest), self.caching, known)
+
+    def estimate(self, job: Job, state: RecordCache, film: Film, first: int, count: int) -> None:
+        """Makes the records of `count` grids."""
+        state.fill(first, count)
+
+    def finish(self, job: Job, state: RecordCache, film: Film) -> dict[str, np.ndarray]:
+        """Adds interpolated light to the film's indirect layer; returns where records are."""
+        reflected = state.reflected(self.fallback_rays)
+        for band in film.bands:
+            job.device.launch(add_reflected, len(band), [film.load(band), reflected, self.spp])
+        if self.records is not None:
+            state.records.moved(job.scene.centre).save(self.records)
+        return {"records": state.picture()}
+
+    def counts(self, state: RecordCache) -> dict[str, int]:
+        """Records, primary hits and those without a record, and rays."""
+        return state.all_counts()
