@@ -21,6 +21,7 @@ from bench.photons import photon_rows
 from bench.reconstruction import AUTHORS, AUTHORS_YARDSTICK, SPP, stage_rows, yardstick
 from bench.report import Row, circumstances, paired_ratio, print_table, row, write_json
 from bench.turns import take_turns
+from bench.vpls import vpl_rows
 from warpgi import checks
 from warpgi.device_scene import DeviceScene
 from warpgi.film import BYTES_PER_PIXEL, Film
@@ -218,6 +219,7 @@ def scene_rows(
         *ray_rows(Tracer(scene, on_device, device, settings.size, settings.spp), scene.name, settings.repeats),
         *path_rows(scene, on_device, settings, peer, note),
         *photon_rows(scene, on_device, settings.size, settings.repeats, pixels * settings.spp),
+        *vpl_rows(scene.name, on_device, settings.size, settings.repeats),
     ]
 
 

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warpgi.kernels.bsdf import has_wide_lobe, is_delta, is_wide, sample, wide_share
+from warpgi.kernels.bsdf import bandwidth, has_wide_lobe, is_delta, is_wide, sample, wide_share
 from warpgi.kernels.camera import Camera
 from warpgi.kernels.direct import (
     add_features,
@@ -13,9 +13,10 @@ from warpgi.kernels.direct import (
     reflects,
 )
 from warpgi.kernels.film import Film, PathSample, add_sample
+from warpgi.kernels.interleaving import Interleaving, add_shared, subset_of
 from warpgi.kernels.path import CAMERA_PAIRS, MAX_SURVIVAL, VERTEX_PAIRS, add_light, inverse_distance, pixel_ray
 from warpgi.kernels.rng import Sampler, make_sampler, sample_2d
-from warpgi.kernels.scene import DIELECTRIC, DIFFUSE, Scene, closest_hit, offset_origin, surface_at
+from warpgi.kernels.scene import DIELECTRIC, Scene, closest_hit, offset_origin, surface_at
 from warpgi.kernels.vpls import COMPENSATED, Joining, Vpls, geometry_kept, reflect_vpls
 
 wp.set_module_options({"enable_backward": False})
@@ -31,17 +32,7 @@ class View:
     seed: int
     sampler: int  # INDEPENDENT or SOBOL
     light_samples: int  # shadow rays to lights from the first surface that scatters
-    interleave: int  # pixels of a square's side that share out the lights
-    width: int  # of the picture
     goes_on: int  # 1: a ray from a surface of wide lobes could meet light that nothing else brings
-
-
-@wp.func
-def first_of_pixel(view: View, pixel: int):
-    """Number of the first light of a pixel's subset (Keller, Heidrich 2001)."""
-    x = pixel % view.width % view.interleave
-    y = pixel // view.width % view.interleave
-    return y * view.interleave + x
 
 
 @wp.func
@@ -50,6 +41,8 @@ def follow(
     vpls: Vpls,
     joining: Joining,
     view: View,
+    first: int,
+    stride: int,
     pixel: int,
     index: int,
     sampler: Sampler,
@@ -57,6 +50,8 @@ def follow(
     d_: wp.vec3,
 ):
     """One camera path: lights bring what wide lobes at both ends send on, geometry clamped; a ray goes for the rest.
+
+    A path that meets a diffuse surface first takes every `stride`-th light from `first` on, others all.
 
     Radiance that leaves a surface by its wide lobes reaches the camera with weight `joined`, from which is taken off
     what lights brought at the surface before; other radiance with weight `rest`.
@@ -71,8 +66,6 @@ def follow(
     eta_scale = float(1.0)
     bsdf_pdf = float(0.0)
     scattered = int(0)
-    stride = int(1)
-    first = int(0)
     depth = int(1)
     while True:
         hit = closest_hit(scene, o, d)
@@ -85,6 +78,7 @@ def follow(
         wo = -d
         if depth == 1:
             path = add_features(path, s, wo, hit.t)
+            path.bandwidth = bandwidth(shape)
         elif depth == 2:
             path.inverse_distance = inverse_distance(hit.t)
         le = emitted(shape, s.ng, wo)
@@ -123,10 +117,9 @@ def follow(
                     path = add_light(path, depth + 1, wp.cw_mul(weight, light.radiance))
             # virtual lights
             if has_wide_lobe(shape, joining.sharpest):
-                if depth == 1 and shape.kind == DIFFUSE:
-                    stride = view.interleave * view.interleave
-                    first = first_of_pixel(view, pixel)
-                found = reflect_vpls(scene, vpls, joining, shape, s, n, wo, first, stride, sampler)
+                begin = wp.where(path.bandwidth == 0.0, first, 0)
+                step = wp.where(path.bandwidth == 0.0, stride, 1)
+                found = reflect_vpls(scene, vpls, joining, shape, s, n, wo, begin, step, sampler)
                 path.shadow_rays = path.shadow_rays + found.shadow_rays
                 path = add_light(path, depth + 2, wp.cw_mul(joined, found.radiance))
             scattered = 1
@@ -164,6 +157,7 @@ def light_pixels(
     vpls: Vpls,
     joining: Joining,
     view: View,
+    interleaving: Interleaving,
     first_sample: int,
     sample_count: int,
     film: Film,
@@ -171,7 +165,13 @@ def light_pixels(
     """One thread owns one pixel: `sample_count` camera paths from `first_sample` on, folded into `film`."""
     i = offset + wp.tid()
     pixel = film.first_pixel + i
+    stride = interleaving.side * interleaving.side
     for index in range(first_sample, first_sample + sample_count):
         sampler = make_sampler(view.seed, pixel, index, view.sampler)
         ray = pixel_ray(camera, sampler, pixel)
-        add_sample(film, i, follow(scene, vpls, joining, view, pixel, index, sampler, ray.o, ray.d))
+        first = subset_of(interleaving, pixel, index)
+        path = follow(scene, vpls, joining, view, first, stride, pixel, index, sampler, ray.o, ray.d)
+        if stride > 1:
+            add_shared(interleaving, film, i, pixel, path)
+        else:
+            add_sample(film, i, path)

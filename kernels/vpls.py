@@ -54,7 +54,7 @@ class Vpls:
     albedo: wp.array[wp.vec3]
     incident: wp.array[wp.vec3]  # towards where the light came from
     # shadow maps, one a light: distance of what is seen through the texels of a square over its hemisphere
-    map_side: int  # texels, 0: visibility by shadow rays
+    map_side: int  # texels, 0: visibility by shadow rays, below 0: all is seen, to measure what visibility costs
     depth: wp.array[float]
 
 
@@ -268,10 +268,10 @@ def reflect_vpls(
             light = wp.cw_mul(f, vpl_intensity(scene, vpls, joining, j, -wi)) * geometry
         if wp.max(light) <= 0.0:
             continue
-        seen = False
+        seen = True
         if vpls.map_side > 0:
             seen = seen_in_map(vpls, j, s, to_light, wp.sqrt(d2))
-        else:
+        elif vpls.map_side == 0:
             o = offset_origin(s.p, s.ng, s.offset, wi)
             d = vpls.target[j] - o
             distance = wp.length(d)

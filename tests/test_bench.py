@@ -50,6 +50,9 @@ def test_rays_prints_a_table_and_writes_json(tmp_path):
     for name in kinds[:2]:
         assert rows[name]["versus"] == "wp.mesh_query_ray"
         assert rows[name]["ratio"] > 0.0
+    for name in ("VPL connections", "VPL connections, all seen"):
+        assert rows[name]["unit"] == "connections/s"
+    assert rows["VPL connections"]["versus"] == "VPL connections, all seen"
     assert rows["sample, host"]["value"] == 72
     for name, authors in content["settings"]["authors"].items():
         per_yardstick = rows[name]["value"] / rows["scipy cKDTree"]["value"]
