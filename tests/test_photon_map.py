@@ -211,6 +211,25 @@ def test_a_coat_weighs_gathered_light_by_its_angle():
     assert gathered == pytest.approx(seen, rel=0.08)
 
 
+def test_the_cache_gathers_from_photons():
+    """Records whose rays read the map show what paths show, caustics once; in a sphere it is the closed form."""
+    scene, expected = integrating_sphere(albedo=0.5, subdivisions=4)
+    method = gi.IrradianceCache(photons=50_000, rays=256, spp=4)
+    sphere = gi.render(scene, method, (16, 16), device="cpu")
+    assert sphere.layers["indirect"].mean() == pytest.approx(expected.indirect_radiance[0], rel=0.02)
+    scene = gi.scenes.build("cornell-spheres")
+    reference = gi.render(scene, gi.PathTracing(spp=1024), (32, 32), seed=1, device="cpu")
+    render = gi.render(scene, dataclasses.replace(method, rays=512), (32, 32), device="cpu")
+    a, b = (r.layers["indirect"].reshape(4, 8, 4, 8, 3).mean(axis=(1, 3)) for r in (reference, render))
+    error = np.sqrt(reference.layers["variance"].reshape(4, 8, 4, 8, 3).mean(axis=(1, 3)) / 64.0)
+    assert (np.abs(a - b) < Z_LIMIT * error + 0.1 * a + 0.02 * a.mean()).all()
+    assert b.mean() == pytest.approx(a.mean(), rel=0.03)
+    assert render.counts["photons"] > 0
+    assert render.counts["records"] < 32 * 32
+    with pytest.raises(ValueError, match="photons and records are both given"):
+        gi.IrradianceCache(photons=1000, records="a.npz")
+
+
 def test_shading_normals_count_for_photons_as_for_paths():
     """Interpolated normals turn light about; its adjoint, which photons follow, agrees (Veach 1997, sec. 5.3)."""
     faces = [(0, 2, 1), (0, 3, 2)]

@@ -63,7 +63,7 @@ def corrected_corners(device: gi.Device) -> Value:
     return Value(abs(value.value), value.error)
 
 
-def _leak(method: gi.PhotonMap, device: gi.Device) -> Value:
+def _leak(method: gi.PhotonMap | gi.IrradianceCache, device: gi.Device) -> Value:
     scene, _ = gi.scenes.leak(open_front=True)
     values = []
     for seed in range(4):
@@ -82,6 +82,11 @@ def leak(device: gi.Device) -> Value:
 def leak_gathered(device: gi.Device) -> Value:
     """The same by final gathering."""
     return _leak(gi.PhotonMap(spp=4, final_gather=8), device)
+
+
+def leak_cached(device: gi.Device) -> Value:
+    """The same by final gathering at the records of an irradiance cache."""
+    return _leak(gi.IrradianceCache(spp=4, rays=256, photons=200_000), device)
 
 
 def leak_any_normal(device: gi.Device) -> Value:
@@ -154,6 +159,7 @@ ROWS = (
     Failure("photon-map", "furnace", "light wrong in corners, corrected", 0.1, corrected_corners),
     Failure("photon-map", "leak", "light of the dark room over the lit one's", 0.03, leak),
     Failure("photon-map", "leak", "the same by final gathering", 0.03, leak_gathered),
+    Failure("photon-map", "leak", "the same by gathering at cached records", 0.03, leak_cached),
     Failure("photon-map", "leak", "the same, photons of any normal taken", None, leak_any_normal),
     Failure("photon-map", "leak", "the same, photons off the plane taken", None, leak_any_plane),
     Failure("photon-map", "leak", "the same, all normals and planes taken", None, leak_taking_all),

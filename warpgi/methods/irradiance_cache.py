@@ -10,12 +10,15 @@ import warp as wp
 
 from warpgi import checks
 from warpgi.film import Film
+from warpgi.gathering import GatheringSource
 from warpgi.irradiance import STRATA_BYTES, PathSource
 from warpgi.job import Job
 from warpgi.kernels.light_field import add_reflected
 from warpgi.kernels.path_strata import trace_strata
+from warpgi.kernels.photon_strata import gather_strata
 from warpgi.kernels.samples import trace_samples
 from warpgi.methods.path import NEVER, Sampler, check_paths
+from warpgi.methods.photon_map import PhotonMap
 from warpgi.record_cache import BYTES_PER_HIT, COARSEST, KERNELS, Caching, RecordCache
 from warpgi.records import Records
 from warpgi.sampling import PRIMARY_BYTES, path_settings, trace_primary_hits
@@ -54,6 +57,9 @@ class IrradianceCache:
     """Extrapolate records by their gradients."""
     fallback_rays: int = 64
     """Paths per pixel where no record serves, such as in foliage."""
+    photons: int = 0
+    """Paths from the lights for photon maps, in which a record's rays end at their first hit: final gathering, with
+    caustics read at the primary hits (Jensen 1996); `max_depth` is then not heeded; 0: none, paths go on."""
     light_samples: int = 32
     """Shadow rays to lights per pixel, shared out over its primary hits, which make the direct light."""
     max_depth: int | None = None
@@ -79,6 +85,9 @@ class IrradianceCache:
             raise ValueError(f"finest is {self.finest}, expected a power of 2")
         if self.records is not None and not isinstance(self.records, str):
             raise TypeError(f"records is {type(self.records).__name__}, expected the name of a file")
+        checks.count("photons", self.photons, 0)
+        if self.photons and self.records is not None:
+            raise ValueError("photons and records are both given, expected one: records by photons hold no caustics")
         check_paths(self.max_depth, self.roulette_depth, self.sampler)
 
     @property
@@ -89,7 +98,8 @@ class IrradianceCache:
     @property
     def kernels(self) -> tuple[wp.Kernel, ...]:
         """What it launches: a kernel of each module."""
-        return (trace_samples, trace_strata, add_reflected, *KERNELS)
+        rays = (gather_strata, *PhotonMap().kernels) if self.photons else (trace_strata,)
+        return (trace_samples, add_reflected, *rays, *KERNELS)
 
     @property
     def caching(self) -> Caching:
@@ -111,7 +121,8 @@ class IrradianceCache:
 
     def device_bytes(self, size: tuple[int, int]) -> int:
         """Device memory it takes beside scene and film."""
-        return size[0] * size[1] * self.spp * (2 * PRIMARY_BYTES + BYTES_PER_HIT) + STRATA_BYTES
+        photons = PhotonMap(photons=self.photons).device_bytes(size) if self.photons else 0
+        return size[0] * size[1] * self.spp * (2 * PRIMARY_BYTES + BYTES_PER_HIT) + STRATA_BYTES + photons
 
     def prepare(self, job: Job, film: Film) -> RecordCache:
         """Traces the primary hits, with all light that is not cached going to the film."""
@@ -120,6 +131,8 @@ class IrradianceCache:
             known = Records.load(self.records).moved(-job.scene.centre)
         paths = path_settings(job, self.max_depth or NEVER, self.roulette_depth or NEVER, self.sampler)
         hits = trace_primary_hits(job, film, self.spp, max(1, self.light_samples // self.spp), paths)
+        if self.photons:
+            return RecordCache(job.device, hits, job.size, GatheringSource(job, hits, self.photons), self.caching)
         rest = path_settings(job, (self.max_depth or NEVER) - 1, self.roulette_depth or NEVER, self.sampler)
         return RecordCache(job.device, hits, job.size, PathSource(job, hits, rest), self.caching, known)
 
@@ -129,9 +142,12 @@ class IrradianceCache:
 
     def finish(self, job: Job, state: RecordCache, film: Film) -> dict[str, np.ndarray]:
         """Adds interpolated light to the film's indirect layer; returns where records are."""
-        reflected = state.reflected(self.fallback_rays)
+        lights = [state.reflected(self.fallback_rays)]
+        if isinstance(state.source, GatheringSource):
+            lights.append(state.source.caustics())
         for band in film.bands:
-            job.device.launch(add_reflected, len(band), [film.load(band), reflected, self.spp])
+            for light in lights:
+                job.device.launch(add_reflected, len(band), [film.load(band), light, self.spp])
         if self.records is not None:
             state.records.moved(job.scene.centre).save(self.records)
         return {"records": state.picture()}

@@ -281,6 +281,23 @@ class Mapping:
         self.counts[what] += shot.count
 
 
+def gathering_map(job: Job, photons: int) -> Mapping:
+    """Maps made for rays that gather, from `photons` paths each."""
+    mapping = Mapping(PhotonMap(photons=photons, caustic_photons=photons, final_gather=1), job)
+    mapping.use(0)
+    return mapping
+
+
+def caustics_at_hits(mapping: Mapping, hits: PrimaryHits) -> wp.array:
+    """The caustic light that each primary hit reflects, vec3 on the device."""
+    device = mapping.job.device
+    origins, normals, albedo = (device.array(a, wp.vec3) for a in (hits.origin, hits.normal, hits.albedo))
+    caustics = device.zeros(len(hits.origin), wp.vec3)
+    inputs = [mapping.job.scene.struct, mapping.maps, origins, normals, albedo]
+    device.launch(kernels.caustics_at, len(hits.origin), inputs, [caustics])
+    return caustics
+
+
 def light_by_photons(job: Job, photons: int, samples: SampleBuffer, hits: PrimaryHits) -> wp.array:
     """Gives the samples' secondary rays the radiance that a photon map knows at their ends.
 
@@ -288,15 +305,11 @@ def light_by_photons(job: Job, photons: int, samples: SampleBuffer, hits: Primar
         The caustic light that each primary hit reflects, vec3 on the device: the maps' samples hold none.
     """
     device = job.device
-    mapping = Mapping(PhotonMap(photons=photons, caustic_photons=photons, final_gather=1), job)
-    mapping.use(0)
-    origins, normals, albedo = (device.array(a, wp.vec3) for a in (hits.origin, hits.normal, hits.albedo))
+    mapping = gathering_map(job, photons)
+    origins, normals = (device.array(a, wp.vec3) for a in (hits.origin, hits.normal))
     radiance = device.array(samples.radiance, wp.vec3)
     step = float(OFFSET_ULPS) * job.scene.radius
     inputs = [job.scene.struct, mapping.maps, mapping.view, step, samples.spp, hits.per_pixel, origins, normals]
     device.launch(kernels.light_samples, len(samples), [*inputs, device.array(samples.hit, wp.vec3)], [radiance])
     samples.radiance[:] = radiance.numpy()
-    caustics = device.zeros(len(hits.origin), wp.vec3)
-    inputs = [job.scene.struct, mapping.maps, origins, normals, albedo]
-    device.launch(kernels.caustics_at, len(hits.origin), inputs, [caustics])
-    return caustics
+    return caustics_at_hits(mapping, hits)
