@@ -33,8 +33,6 @@ LADDERS: dict[str, tuple[Settings, ...]] = {
             (4, 50_000, 4),
             (8, 100_000, 8),
             (16, 200_000, 8),
-            (16, 200_000, 32),
-            (64, 400_000, 16),
         )
     ),
     "instant-radiosity": tuple({"paths": paths} for paths in (10, 32, 64, 256, 1024)),
@@ -42,8 +40,8 @@ LADDERS: dict[str, tuple[Settings, ...]] = {
         {"rays": rays, "tolerance": tolerance, "light_samples": 8}
         for rays, tolerance in ((64, 0.5), (256, 0.4), (1024, 0.3), (4096, 0.3), (4096, 0.2))
     ),
-    "a-trous": powers(64),
-    "random-parameter-filter": powers(16),
+    "a-trous": powers(16),
+    "random-parameter-filter": powers(8),
     "irradiance-filter": powers(64),
     "meshless-hierarchy": tuple(
         {"spp": spp, "rays": rays, "tolerance": tolerance, "primary_hits": max(4, spp)}
