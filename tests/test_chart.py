@@ -416,6 +416,12 @@ def test_a_stale_reference_is_not_taken(bench, monkeypatch):
     assert len(set(keys)) == len(keys)
 
 
+def test_no_two_lines_look_alike(bench):
+    """Colour and marker together tell every contender from all others."""
+    count = len(bench.contenders.LADDERS) + len(bench.contenders.PEERS)
+    assert len({bench.chart_plot.style(index) for index in range(count)}) == count
+
+
 def test_another_process_finds_the_reference(bench):
     """The key of a scene depends on values alone, so that a reference serves every later run."""
     asked = "import warpgi as gi; from bench.reference import fingerprint as key; "
