@@ -11,7 +11,7 @@ PICTURE = "chart.png"
 
 # Okabe, Ito 2008: told apart with any kind of colour vision, and by their markers without.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8c6d31", "#7f3c8d", "#888888")
-MARKERS = "osD^vP*Xph"
+MARKERS = "osD^vP*Xph<"  # one more than colours, so that no pair comes back soon
 PANEL = (5.6, 4.4)  # inches
 
 

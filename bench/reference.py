@@ -158,6 +158,8 @@ def _add_struct(digest: Any, struct: Any) -> None:
             digest.update(repr(value.shape).encode() + np.ascontiguousarray(value.numpy()).tobytes())
         elif hasattr(value, "_cls"):
             _add_struct(digest, value)
+        elif value is None:  # an array that the scene does not need; as an object it would be its address
+            digest.update(b"none")
         else:
             digest.update(np.asarray(value).tobytes())
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -412,6 +414,22 @@ def test_a_stale_reference_is_not_taken(bench, monkeypatch):
     monkeypatch.setattr(kernel.module, "get_module_hash", lambda block: code[::-1])
     keys.append(key())
     assert len(set(keys)) == len(keys)
+
+
+def test_no_two_lines_look_alike(bench):
+    """Colour and marker together tell every contender from all others."""
+    count = len(bench.contenders.LADDERS) + len(bench.contenders.PEERS)
+    assert len({bench.chart_plot.style(index) for index in range(count)}) == count
+
+
+def test_another_process_finds_the_reference(bench):
+    """The key of a scene depends on values alone, so that a reference serves every later run."""
+    asked = "import warpgi as gi; from bench.reference import fingerprint as key; "
+    asked += "print(key(gi.scenes.cornell_box(), (8, 8), gi.PathTracing(spp=1), gi.Device('cpu')))"
+    folder = bench.reference.CHECKOUT
+    there = subprocess.run([sys.executable, "-c", asked], cwd=folder, capture_output=True, text=True, check=True)
+    here = bench.reference.fingerprint(gi.scenes.cornell_box(), (8, 8), gi.PathTracing(spp=1), gi.Device("cpu"))
+    assert there.stdout.strip() == here
 
 
 def test_every_method_is_charted_or_said_not_to_be(bench):
