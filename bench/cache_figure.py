@@ -10,6 +10,7 @@ import numpy as np
 import warpgi as gi
 from bench.figures import GAP, WHITE
 from bench.reference import make_reference
+from warpgi import checks
 from warpgi.image import check_output, write_png
 
 METHODS = (
@@ -21,6 +22,8 @@ METHODS = (
 def draw(out: Path, size: tuple[int, int], reference_spp: int, device: str | None) -> None:
     """Indirect light of the Cornell box by both irradiance caches, the records of the second, and the reference."""
     check_output(out)
+    checks.image_size(size)
+    checks.count("reference_spp", reference_spp, 2)
     scene, where = gi.scenes.cornell_box(), gi.Device(device)
     reference = make_reference(scene, size, reference_spp, device=where)
     renders = [gi.render(scene, method, size, device=where) for method in METHODS]

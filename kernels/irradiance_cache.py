@@ -6,7 +6,7 @@ Lamorlette 2004), so that no seam shows where a record begins to count.
 
 import warp as wp
 
-from warpgi.kernels.lanes import LANES_HEAD
+from warpgi.kernels.lanes import POINT_WALK
 from warpgi.kernels.sampling import INV_PI
 from warpgi.kernels.splats import SplatTree
 
@@ -24,30 +24,10 @@ vec6 = wp.types.vector(length=6, dtype=wp.float32)
 # (Ward, Heckbert 1992). Returns weighted irradiance (3), weight, the least error and the weighted squared mean of the
 # channels.
 LOOK_UP = (
-    LANES_HEAD
+    "    float sum[3] = {0.0f, 0.0f, 0.0f};\n"
+    "    float weight = 0.0f, least = 1.0e30f, squares = 0.0f;\n"
+    + POINT_WALK
     + """
-    int stack[128];
-    int top = 1;
-    stack[0] = 0;
-    float sum[3] = {0.0f, 0.0f, 0.0f};
-    float weight = 0.0f, least = 1.0e30f, squares = 0.0f;
-    while (top > 0) {
-        const int current = stack[--top];
-        if (current >= 0) {
-            const float* p = tree.nodes.data + (size_t)current * 48;
-            int met[8];
-            for (int k = 0; k < 8; ++k)
-                met[k] = (int)((x[0] >= p[k]) & (x[1] >= p[8 + k]) & (x[2] >= p[16 + k]) & (x[0] <= p[24 + k]) &
-                               (x[1] <= p[32 + k]) & (x[2] <= p[40 + k]));
-            const int first = tree.first.data[current];
-            unsigned mask = lane_mask(met);
-            while (mask) {
-                const int k = next_lane(mask);
-                stack[top++] = first >= 0 ? first + k : first - k;
-            }
-        } else {
-            const int block = -1 - current;
-            const float* p = tree.blocks.data + (size_t)block * 80;
             float d2[8], turn[8];
             int met[8];
             for (int k = 0; k < 8; ++k) {

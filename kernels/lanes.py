@@ -41,3 +41,31 @@ LANES_HEAD = """
     auto larger = [](float a, float b) { return a > b ? a : b; };
     auto smaller = [](float a, float b) { return a < b ? a : b; };
 """
+
+# Native code that walks a splat tree to the blocks whose boxes hold the point x; what follows does something with
+# `block`, whose numbers are at `p`, and closes two braces.
+POINT_WALK = (
+    LANES_HEAD
+    + """
+    int stack[128];
+    int top = 1;
+    stack[0] = 0;
+    while (top > 0) {
+        const int current = stack[--top];
+        if (current >= 0) {
+            const float* p = tree.nodes.data + (size_t)current * 48;
+            int met[8];
+            for (int k = 0; k < 8; ++k)
+                met[k] = (int)((x[0] >= p[k]) & (x[1] >= p[8 + k]) & (x[2] >= p[16 + k]) & (x[0] <= p[24 + k]) &
+                               (x[1] <= p[32 + k]) & (x[2] <= p[40 + k]));
+            const int first = tree.first.data[current];
+            unsigned mask = lane_mask(met);
+            while (mask) {
+                const int k = next_lane(mask);
+                stack[top++] = first >= 0 ? first + k : first - k;
+            }
+        } else {
+            const int block = -1 - current;
+            const float* p = tree.blocks.data + (size_t)block * 80;
+"""
+)

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from warpgi.kernels.film import is_finite
 from warpgi.kernels.hemisphere import Hemispheres, stratum_direction
 from warpgi.kernels.path import CAMERA_PAIRS, VERTEX_PAIRS, PathSettings, trace_path
 from warpgi.kernels.rng import make_sampler, sample_2d
@@ -22,7 +23,7 @@ def incident_light(
     sampler = make_sampler(settings.seed, key, number, settings.sampler)
     path = trace_path(scene, settings, sampler, REST_PAIR, offset_origin(p, n, step, d), d, 0.0)
     light = path.direct + path.indirect
-    if not (wp.isfinite(light[0]) and wp.isfinite(light[1]) and wp.isfinite(light[2])):
+    if not is_finite(light):
         return wp.vec4(0.0, 0.0, 0.0, -1.0)
     return wp.vec4(light[0], light[1], light[2], wp.where(path.depth >= 0.0, path.depth, FAR))
 

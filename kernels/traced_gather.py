@@ -3,7 +3,7 @@
 import warp as wp
 
 from warpgi.kernels.hemisphere import Hemispheres, stratum_direction
-from warpgi.kernels.lanes import LANES_HEAD
+from warpgi.kernels.lanes import POINT_WALK
 from warpgi.kernels.light_field import GATHER_PAIR, Gathered, Incident, Receivers
 from warpgi.kernels.rng import SOBOL, make_sampler, sample_2d
 from warpgi.kernels.sampling import make_frame, square_to_cosine_hemisphere, to_world
@@ -16,28 +16,9 @@ wp.set_module_options({"enable_backward": False})
 # reconstruction rays. Splats turned by more than 45 degrees, or whose plane is far, are of another surface. The tree's
 # boxes are those of balls.
 COVERING = (
-    LANES_HEAD
+    "    float r = 0.0f, g = 0.0f, b = 0.0f, weight = 0.0f;\n"
+    + POINT_WALK
     + """
-    int stack[128];
-    int top = 1;
-    stack[0] = 0;
-    float r = 0.0f, g = 0.0f, b = 0.0f, weight = 0.0f;
-    while (top > 0) {
-        const int current = stack[--top];
-        if (current >= 0) {
-            const float* p = tree.nodes.data + (size_t)current * 48;
-            int met[8];
-            for (int k = 0; k < 8; ++k)
-                met[k] = (int)((x[0] >= p[k]) & (x[1] >= p[8 + k]) & (x[2] >= p[16 + k]) & (x[0] <= p[24 + k]) &
-                               (x[1] <= p[32 + k]) & (x[2] <= p[40 + k]));
-            const int first = tree.first.data[current];
-            unsigned mask = lane_mask(met);
-            while (mask) {
-                const int k = next_lane(mask);
-                stack[top++] = first >= 0 ? first + k : first - k;
-            }
-        } else {
-            const float* p = tree.blocks.data + (size_t)(-1 - current) * 80;
             float w[8];
             for (int k = 0; k < 8; ++k) {
                 const float dx = x[0] - p[k], dy = x[1] - p[8 + k], dz = x[2] - p[16 + k];

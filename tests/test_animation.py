@@ -116,13 +116,15 @@ def test_other_settings_make_other_frames(tmp_path, change):
     assert animate(tmp_path, resume=True, **change).rendered == (0, 1, 2)
 
 
-def test_killed_and_resumed_gives_the_same_files(tmp_path):
-    """SIGKILL in the middle of a run, then --resume: the files of a run that nobody killed, to the last bit."""
-    command = [sys.executable, "-m", "warpgi", "animate", "moving-light:frames=5", "path", "--spp", "200"]
-    command += ["--size", "32", "32", "--device", "cpu", "--out"]
-    process = subprocess.Popen(
-        [*command, str(tmp_path / "killed" / "f-{:03d}.exr")], cwd=tmp_path, stdout=subprocess.DEVNULL
-    )
+@pytest.mark.parametrize(
+    "method", [("path", "--spp", "200"), ("instant-radiosity", "--paths", "64", "--renewed-paths", "2", "--spp", "8")]
+)
+def test_killed_and_resumed_gives_the_same_files(tmp_path, method):
+    """SIGKILL in the middle of a run, then --resume: the files of a run that nobody killed, to the last bit; also where
+    lights are kept from frame to frame."""
+    arguments = ["animate", "moving-light:frames=5", *method, "--size", "32", "32", "--device", "cpu"]
+    command = [sys.executable, "-m", "warpgi", *arguments, "--out", str(tmp_path / "killed" / "f-{:03d}.exr")]
+    process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL)
     try:
         while not (tmp_path / "killed" / "f-001.exr").exists():
             assert process.poll() is None
@@ -131,7 +133,6 @@ def test_killed_and_resumed_gives_the_same_files(tmp_path):
     finally:
         process.wait(timeout=60)
     assert not (tmp_path / "killed" / "f-004.exr").exists(), "the run was over before it could be killed"
-    arguments = ["animate", "moving-light:frames=5", "path", "--spp", "200", "--size", "32", "32", "--device", "cpu"]
     assert main([*arguments, "--out", str(tmp_path / "killed" / "f-{:03d}.exr"), "--resume"]) == 0
     assert main([*arguments, "--out", str(tmp_path / "whole" / "f-{:03d}.exr")]) == 0
     assert contents(tmp_path / "killed") == contents(tmp_path / "whole")

@@ -107,6 +107,22 @@ def test_scaling_compares_rays_samples_and_scenes(bench, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
+        ("--size 0 0", "width is 0"),
+        ("--reference-spp 0", "reference_spp is 0"),
+        ("--out a.txt", "a.txt"),
+    ],
+)
+def test_the_picture_of_caches_refuses_mistakes(bench, capsys, arguments, words):
+    """Before anything is rendered, in one sentence."""
+    given = arguments if "--out" in arguments else f"{arguments} --out a.png"
+    assert bench.__main__.main(["cache", *given.split()]) == 2
+    error = capsys.readouterr().err
+    assert words in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
         ("--device abacus", "device is 'abacus'"),
         ("--scenes cornell-bax", "did you mean 'cornell-box'"),
         ("--size 0 32", "width is 0"),
