@@ -15,8 +15,8 @@ import warpgi as gi
 from bench.mitsuba_peer import MissingPeer
 from bench.reference import Reference, make_reference
 from bench.report import circumstances, finite, progress
-from warpgi.animate import FrameRenderer
 from warpgi.filter_animation import FilterRun
+from warpgi.frame_renderer import FrameRenderer
 from warpgi.image import atomic_write, check_output
 from warpgi.metrics import RELMSE_EPSILON, RELMSE_MEAN
 from warpgi.modes import Modes
