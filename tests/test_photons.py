@@ -61,6 +61,7 @@ def estimate(
 def search(
     offset: int,
     tree: SplatTreeStruct,
+    centres: SplatTreeStruct,
     covers: SplatTreeStruct,
     x: wp.array[wp.vec3],
     n: wp.array[wp.vec3],
@@ -78,7 +79,7 @@ def search(
     i = offset + wp.tid()
     result[i] = nearest_photons(tree, x[i], n[i], k, guess2, limit2, scale2, stretch, facing, 0)
     near[i] = near_photons(tree, x[i], n[i], limit2, stretch, facing, 0)
-    place[i] = nearest_place(covers, x[i], n[i], stretch, facing)
+    place[i] = nearest_place(centres, covers, wp.min(limit2, 0.1), x[i], n[i], stretch, facing)
 
 
 @wp.kernel
@@ -297,17 +298,18 @@ def test_search_equals_brute_force(limit, guess):
     found, near = (device.zeros(count, vec8) for _ in range(2))
     place = device.zeros(count, int)
     covers, reach2 = source.tree(shot, np.arange(shot.count, dtype=np.int32)), rng.uniform(0.0, 0.2, shot.count)
+    centres = covers.with_present_boxes()
     covers.set_radius2(device.array(reach2[covers.order.numpy()], float))
     covers.refit_as_balls()
     points = [device.array(x, wp.vec3), device.array(n, wp.vec3)]
     device.launch(
         search,
         count,
-        [tree.struct, covers.struct, *points, k, guess, limit2, 1.0, stretch, facing],
+        [tree.struct, centres, covers.struct, *points, k, guess, limit2, 1.0, stretch, facing],
         [found, near, place],
     )
     finer, unused = device.zeros(count, vec8), [device.zeros(count, vec8), device.zeros(count, int)]
-    inputs = [tree.struct, covers.struct, *points, k, guess, limit2, 0.25, stretch, facing]
+    inputs = [tree.struct, centres, covers.struct, *points, k, guess, limit2, 0.25, stretch, facing]
     device.launch(search, count, inputs, [finer, *unused])
     order, place = covers.order.numpy(), place.numpy()
     assert 0.1 < (place >= 0).mean() < 1.0
