@@ -233,8 +233,8 @@ def gather_irradiance(
     irradiance: wp.array[wp.vec3],
     inverse_distance: wp.array[float],
 ):
-    """One thread owns one point, a little off its surface: irradiance of indirect light but caustics, by gathering,
-    and the mean of 1 / distance over its rays.
+    """One thread owns one point, a little off its surface: irradiance of indirect light by gathering, without that
+    of caustics here and elsewhere, and the mean of 1 / distance over its rays.
     """
     i = offset + wp.tid()
     total = wp.vec3(0.0)

@@ -86,8 +86,8 @@ class PhotonMap:
     and blurs more."""
     radius: float | None = None
     """Radius [scene units] beyond which there are no photons in an estimate, above 0; None: none such."""
-    caustic_neighbours: int = 50
-    """`neighbours` for the map of caustics."""
+    caustic_neighbours: int = 20
+    """`neighbours` for the map of caustics, whose edges are sharp."""
     caustic_radius: float | None = None
     """`radius` for the map of caustics; None: a twentieth of the radius of the scene."""
     kernel: Kernel = Kernel.EPANECHNIKOV
