@@ -355,6 +355,7 @@ def test_radii_equal_scipys(k):
     inputs = [
         tree.struct,
         tree.struct,
+        tree.struct,
         device.array(x, wp.vec3),
         device.array(n, wp.vec3),
         k,
