@@ -59,6 +59,9 @@ class SampleArrays:
     time: wp.array[float]  # part of the shutter's interval
     origin_motion: wp.array[wp.vec3]  # while the shutter is open
     hit_motion: wp.array[wp.vec3]
+    # where on the surface the primary hit lies; empty where nobody asked
+    face: wp.array[int]  # -1: nowhere
+    bary: wp.array[wp.vec2]
     # for glossy reconstruction; empty where nobody asked, and then surfaces that are not diffuse are not recorded
     material: wp.array[int]  # number of the primary hit's shape
     wo: wp.array[wp.vec3]  # from the primary hit towards what sees it
@@ -85,6 +88,9 @@ def record_receiver(
     samples.origin[place] = s.p
     samples.origin_normal[place] = n
     samples.albedo[place] = albedo
+    if samples.face.shape[0] > 0:
+        samples.face[place] = hit.face
+        samples.bary[place] = wp.vec2(hit.u, hit.v)
     if samples.wo.shape[0] > 0:
         samples.material[place] = scene.face_shapes[hit.face]
         samples.wo[place] = wo
@@ -117,6 +123,8 @@ def trace_samples(
         place = (samples.first_pixel + i) * samples.hits + index
         k = (samples.first_pixel + i) * samples.spp + index
         samples.origin[place] = wp.vec3(NO_HIT)
+        if samples.face.shape[0] > 0:
+            samples.face[place] = -1
         if index < samples.spp:
             samples.hit[k] = wp.vec3(NO_HIT)
         sampler = make_sampler(settings.seed, pixel, index, settings.sampler)

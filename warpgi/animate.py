@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import time
 from collections import Counter
@@ -24,12 +23,14 @@ from warpgi.filter_animation import filter_frames
 from warpgi.fingerprint import fingerprint
 from warpgi.frame_files import FrameFiles
 from warpgi.job import Job
-from warpgi.methods import Method, PathTracing, StatisticalFilter
+from warpgi.methods import Method, PathTracing, PointFilter, StatisticalFilter
+from warpgi.point_animation import render_points
 from warpgi.progress import Progress, progress_bar
 from warpgi.render import check_method, render_scene
 from warpgi.resampling import trace_pixels
 from warpgi.result import Render
 from warpgi.scene import Scene
+from warpgi.seeds import frame_seed
 from warpgi.sequence import Sequence
 
 FORMAT = 1
@@ -37,7 +38,7 @@ FORMAT = 1
 
 def render_animation(
     sequence: Sequence,
-    method: Method | StatisticalFilter | None = None,
+    method: Method | StatisticalFilter | PointFilter | None = None,
     size: tuple[int, int] = (256, 256),
     seed: int = 0,
     device: str | Device | None = None,
@@ -55,7 +56,8 @@ def render_animation(
     Args:
         sequence: what to render.
         method: how, as in `render`; path tracing by default. One with `prepare_next` carries state from frame to frame.
-            `StatisticalFilter` renders noisy frames, which it keeps in a folder "noisy" beside `out`, and filters them.
+            `StatisticalFilter` renders noisy frames, which it keeps in a folder "noisy" beside `out`, and filters them;
+            `PointFilter` does the like with light at points of surfaces, for cameras and objects that move.
         size: (width, height) in pixels.
         seed: which random numbers, 0 to 2^31 - 1.
         device: "cpu", "cuda:0", a `Device`, or None for a GPU if there is one.
@@ -88,11 +90,14 @@ def render_animation(
     numbers = checked_frames(sequence, frames)
     filtered = method if isinstance(method, StatisticalFilter) else None
     estimator: Any = method if filtered is None else filtered.noisy
-    if filtered is not None and not vary_seed:
-        raise ValueError("vary_seed is False, expected True: StatisticalFilter would take equal noise for light")
-    check_method(sequence.scene(numbers[0]), estimator)
+    on_points = method if isinstance(method, PointFilter) else None
+    if (filtered is not None or on_points is not None) and not vary_seed:
+        raise ValueError(f"vary_seed is False, expected True: {type(method).__name__} would take equal noise for light")
+    check_method(sequence.scene(numbers[0]), estimator if on_points is None else PathTracing())
     if resume and out is None:
         raise ValueError("resume is True, expected False where out is None: there are no files to go on from")
+    if on_points is not None:
+        return render_points(sequence, on_points, size, seed, as_device(device), progress, out, resume, numbers)
     pattern = None if out is None else noisy_pattern(out) if filtered else out
     files = None if pattern is None else FrameFiles(pattern)
     renderer = FrameRenderer(sequence, estimator, size, seed, as_device(device), vary_seed)
@@ -139,11 +144,6 @@ def noisy_pattern(out: str | os.PathLike[str]) -> Path:
         raise TypeError(f"out is {type(out).__name__}, expected a path such as folder/frame-{{:04d}}.exr")
     path = Path(out)
     return path.with_name("noisy") / path.name
-
-
-def frame_seed(seed: int, frame: int) -> int:
-    """The seed of one frame, 0 to 2^31 - 1: a hash, so that neighbouring frames and seeds share nothing."""
-    return int.from_bytes(hashlib.sha256(f"{seed} {frame}".encode()).digest()[:4], "little") >> 1
 
 
 def checked_frames(sequence: Sequence, frames: Iterable[int] | None) -> tuple[int, ...]:

@@ -19,7 +19,7 @@ from warpgi.methods.statistical_filter import StatisticalFilter
 from warpgi.progress import Progress, progress_bar
 from warpgi.render import provenance
 from warpgi.result import Render
-from warpgi.statistical_filtering import FrameMatrix, Projection
+from warpgi.statistical_filtering import FrameMatrix, PixelSmoother, Projection
 from warpgi.timing import Timings
 
 # File beside the filtered frames that holds the basis functions.
@@ -138,7 +138,8 @@ class FilterRun:
         size = (self.width, self.height)
         with self.timings.stage("filter"):
             matrix = FrameMatrix(self._load, len(noisy), size, device)
-            self._projection = Projection(matrix, method, size, self._features.means)
+            smooth = PixelSmoother(method, size, device, self._features.means)
+            self._projection = Projection(matrix, method, size, smooth)
         # reading happened in there
         self.timings["filter"] -= self.timings["read"]
         self.modes = self._projection.modes

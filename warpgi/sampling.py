@@ -30,6 +30,7 @@ GLOSS = (
     {"material": int, "wo": wp.vec3, "reflectance": wp.vec3},
     {"layer": int, "bandwidth": float, "base_radiance": wp.vec3},
 )
+PLACE = {"face": int, "bary": wp.vec2}  # of a primary hit on its surface
 #: Device bytes of a primary hit, and of a secondary ray beside it.
 PRIMARY_BYTES, SECONDARY_BYTES = 12 * len(PRIMARY), 12 * len(SECONDARY + HIT_LIGHT)
 
@@ -88,12 +89,16 @@ def trace_sample_buffer(
     return SampleBuffer(job.size[0], job.size[1], spp, **values, **_projection(job)), every
 
 
-def trace_primary_hits(job: Job, film: Film, hits: int, light_samples: int, paths: PathSettings) -> PrimaryHits:
+def trace_primary_hits(
+    job: Job, film: Film, hits: int, light_samples: int, paths: PathSettings, with_place: bool = False
+) -> PrimaryHits:
     """Traces a picture's primary hits alone; positions stay relative to the device's origin. Direct light, and all
     light of surfaces that are not diffuse, goes to the film."""
-    arrays = _trace(job, film, hits, 0, light_samples, paths, dict.fromkeys(PRIMARY, wp.vec3), {})
+    of_hits: dict[str, Any] = dict.fromkeys(PRIMARY, wp.vec3) | (PLACE if with_place else {})
+    arrays = _trace(job, film, hits, 0, light_samples, paths, of_hits, {})
     origin, normal, albedo = (getattr(arrays, name).numpy() for name in PRIMARY)
-    return PrimaryHits(origin, normal, albedo, hits)
+    place = {name: getattr(arrays, name).numpy() for name in PLACE if with_place}
+    return PrimaryHits(origin, normal, albedo, hits, **place)
 
 
 def _trace(
