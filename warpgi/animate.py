@@ -93,7 +93,8 @@ def render_animation(
     on_points = method if isinstance(method, PointFilter) else None
     if (filtered is not None or on_points is not None) and not vary_seed:
         raise ValueError(f"vary_seed is False, expected True: {type(method).__name__} would take equal noise for light")
-    check_method(sequence.scene(numbers[0]), estimator if on_points is None else PathTracing())
+    if on_points is None:
+        check_method(sequence.scene(numbers[0]), estimator)
     if resume and out is None:
         raise ValueError("resume is True, expected False where out is None: there are no files to go on from")
     if on_points is not None:

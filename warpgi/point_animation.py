@@ -134,7 +134,13 @@ class PointRun:
         self._identities: dict[int, str] = {}
 
     def look_at(self, number: int) -> None:
-        """Looks for places of points in a frame."""
+        """Looks for places of points in a frame.
+
+        Raises:
+            ValueError: shapes move while its shutter is open.
+        """
+        if self.sequence.scene(number).moves:
+            raise ValueError(f"frame {number}: the scene moves, which PointFilter cannot render, expected a still one")
         with self.timings.stage("points"):
             self._collector.add_frame(self._job(number, frame_seed(self.seed, number)), self._rays_per_pixel)
 
@@ -213,7 +219,8 @@ class PointRun:
     def _found(self, number: int, identity: str) -> bool:
         """Whether a frame's light is on disk, whole, and of this identity."""
         try:
-            with np.load(self._path(number), allow_pickle=False) as data:
+            # numpy leaves what is no archive open
+            with open(self._path(number), "rb") as file, np.load(file, allow_pickle=False) as data:
                 return str(data["identity"]) == identity and len(data["irradiance"]) == len(self.points)
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
             return False
