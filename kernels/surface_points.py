@@ -5,7 +5,7 @@ Distances between points are those of a rest pose, one frame's, so that they sta
 
 import warp as wp
 
-from warpgi.kernels.bsdf import is_delta, sample
+from warpgi.kernels.bsdf import is_delta, is_wide, sample
 from warpgi.kernels.camera import Camera
 from warpgi.kernels.direct import facing_normal
 from warpgi.kernels.lanes import POINT_WALK
@@ -53,8 +53,18 @@ def triangle_area(scene: Scene, face: int):
 
 
 @wp.kernel
-def trace_places(offset: int, scene: Scene, rest: Scene, camera: Camera, seed: int, per_pixel: int, places: Places):
-    """One thread owns one camera ray: the first surface that scatters its light, behind mirrors and glass too."""
+def trace_places(
+    offset: int,
+    scene: Scene,
+    rest: Scene,
+    camera: Camera,
+    seed: int,
+    per_pixel: int,
+    exponent: float,
+    places: Places,
+):
+    """One thread owns one camera ray: the first surface that scatters its light, behind mirrors and glass too, but not
+    where its Blinn exponent is above `exponent`."""
     i = offset + wp.tid()
     places.face[i] = -1
     pixel = i // per_pixel
@@ -71,6 +81,8 @@ def trace_places(offset: int, scene: Scene, rest: Scene, camera: Camera, seed: i
         shape = scene.shapes[scene.face_shapes[hit.face]]
         s = surface_at(scene, hit, shape)
         if not is_delta(shape.kind):
+            if not is_wide(shape, exponent):
+                break
             side = wp.where(wp.dot(s.ng, d) < 0.0, 1.0, -1.0)
             bary = wp.vec2(hit.u, hit.v)
             at = place(rest, hit.face, bary)
@@ -223,11 +235,8 @@ def find_points(
     shape: wp.array[int],
     table: Table,
 ):
-    """One thread owns one place in the rest pose, of a shape, -1 for none, and writes its part of the table."""
+    """One thread owns one place in the rest pose, of a shape, and writes its part of the table."""
     i = offset + wp.tid()
-    if shape[i] < 0:
-        table.count[i] = -1
-        return
     table.count[i] = find_around(
         tree, shapes, position[i], normal[i], shape[i], EDGE_ON, MOST, i * MOST, table.points, table.weights
     )
@@ -241,36 +250,25 @@ def place_hits(
     face: wp.array[int],
     bary: wp.array[wp.vec2],
     normal_now: wp.array[wp.vec3],
-    first: int,
     position: wp.array[wp.vec3],
     normal: wp.array[wp.vec3],
     shape: wp.array[int],
 ):
     """One thread owns one primary hit of a frame: where it is in the rest pose, and of which shape."""
     i = offset + wp.tid()
-    h = first + i
-    shape[i] = -1
-    if face[h] >= 0:
-        s = place(rest, face[h], bary[h])
-        side = wp.where(wp.dot(triangle_at(scene, face[h]).ng, normal_now[h]) >= 0.0, 1.0, -1.0)
-        position[i] = s.p
-        normal[i] = s.n * side
-        shape[i] = rest.face_shapes[face[h]]
+    s = place(rest, face[i], bary[i])
+    side = wp.where(wp.dot(triangle_at(scene, face[i]).ng, normal_now[i]) >= 0.0, 1.0, -1.0)
+    position[i] = s.p
+    normal[i] = s.n * side
+    shape[i] = rest.face_shapes[face[i]]
 
 
 @wp.kernel
-def interpolate(
-    offset: int,
-    table: Table,
-    values: wp.array[wp.vec3],
-    first: int,
-    result: wp.array[wp.vec3],
-    uncovered: wp.array[int],
-):
-    """One thread owns one place: the mean of what the points around it say, or a mark where there is none."""
-    i = offset + wp.tid()
+def mix_values(offset: int, table: Table, width: int, values: wp.array[wp.vec3], mixed: wp.array[wp.vec3]):
+    """One thread owns one of `width` values at one place: the mean of what the points around it have, 0 without any."""
+    tid = offset + wp.tid()
+    i = tid // width
     total = wp.vec3(0.0)
     for k in range(table.count[i]):
-        total = total + values[table.points[i * MOST + k]] * table.weights[i * MOST + k]
-    result[first + i] = total
-    uncovered[first + i] = wp.where(table.count[i] == 0, 1, 0)
+        total = total + values[table.points[i * MOST + k] * width + tid % width] * table.weights[i * MOST + k]
+    mixed[tid] = total

@@ -9,7 +9,7 @@ import warpgi as gi
 from warpgi.__main__ import main
 from warpgi.animate import render_animation
 from warpgi.device_scene import DeviceScene
-from warpgi.point_animation import PointRun, point_light
+from warpgi.point_animation import PointRun
 from warpgi.scenes.primitives import box, quad
 from warpgi.seeds import frame_seed
 
@@ -33,11 +33,11 @@ def run_of(sequence, device=None, traced=True, **settings):
 
 def filtered(run):
     """Filtered light at the points, shape (N, P, 3)."""
-    return np.stack([run._projection.frame(i).reshape(-1, 3) for i in range(len(run.numbers))])
+    return np.stack([run.filtered(i)[0][:, 0] for i in range(len(run.numbers))])
 
 
 def noisy(run):
-    return np.stack([run._load(i) for i in range(len(run.numbers))])
+    return np.stack([run._load("irradiance", i)[:, 0] for i in range(len(run.numbers))])
 
 
 def still(frames):
@@ -64,8 +64,8 @@ def test_a_still_scene_is_its_mean(still_run):
 def test_variance_falls_by_the_number_of_frames(still_run):
     """Filtered light and the mean of 16 other frames at the same points differ by two parts of 1/16 of the variance of
     single frames."""
-    method, seeds = still_run.method, [frame_seed(77, n) for n in range(16)]
-    light = np.stack([point_light(still_run._job(n, s), still_run.points, method)[0] for n, s in enumerate(seeds)])
+    jobs = [still_run._job(n, frame_seed(77, n)) for n in range(16)]
+    light = np.stack([still_run.lights[0].trace(job)[0][:, 0] for job in jobs])
     single = noisy(still_run).var(axis=0, ddof=1).mean()
     difference = light.mean(axis=0) - filtered(still_run)[0]
     # some thousand values: their mean square is known to a few percent
@@ -106,10 +106,10 @@ def test_light_that_moves_along_stays():
     """Where shapes, lights and camera move as one, each point's light with the same random numbers stays the same."""
     scene = gi.scenes.cornell_box()
     run = run_of(gi.Sequence(3, lambda frame: moved(scene, (0.3 * frame, 0.0, -0.1 * frame))), traced=False)
-    first, *others = (point_light(run._job(n, 3), run.points, run.method)[0] for n in range(3))
+    first, *others = (run.lights[0].trace(run._job(n, 3))[0] for n in range(3))
     for other in others:
         # rounding turns a path in a thousand at an edge
-        same = np.isclose(other, first, rtol=1e-3, atol=1e-4).all(axis=1)
+        same = np.isclose(other, first, rtol=1e-3, atol=1e-4).all(axis=(1, 2))
         assert same.mean() > 0.97
 
 
@@ -224,11 +224,12 @@ def test_a_constant_is_kept_everywhere(ball_run):
     hits have points."""
     for index in range(4):
         picture, state = hits_of(ball_run, index)
-        constant = np.tile(np.float32([1.0, 2.0, 3.0]), (len(ball_run.points), 1))
-        values, alone = ball_run.lookup.at_hits(picture, state, constant)
-        met = np.setdiff1d(np.flatnonzero(state.face >= 0), alone)
-        np.testing.assert_allclose(values.numpy()[met], np.tile([1.0, 2.0, 3.0], (len(met), 1)), rtol=1e-5)
-        assert len(alone) < 0.01 * len(state.face)
+        constant = np.tile(np.float32([1.0, 2.0, 3.0]), (len(ball_run.points), 1, 1))
+        met = np.flatnonzero(state.face >= 0).astype(np.int32)
+        values, found = ball_run.lights[0].lookup.at_hits(picture, state, met, constant)
+        expected = np.tile([1.0, 2.0, 3.0], (np.count_nonzero(found), 1))
+        np.testing.assert_allclose(values.numpy()[found > 0], expected, rtol=1e-5)
+        assert np.count_nonzero(found == 0) < 0.01 * len(met)
 
 
 def hits_of(run, index):
@@ -247,16 +248,16 @@ def test_light_is_not_taken_from_another_shape(ball_run):
     """A ball's hits read the ball's points alone, wherever it is, though others were near it in the rest pose."""
     for index in (0, 3):
         scene, hits = hits_of(ball_run, index)
-        own = np.repeat(ball_run.points.shape[:, None], 3, axis=1).astype(np.float32)
-        values, alone = ball_run.lookup.at_hits(scene, hits, own)
-        met = np.setdiff1d(np.flatnonzero(hits.face >= 0), alone)
+        own = np.repeat(ball_run.points.shape[:, None, None], 3, axis=2).astype(np.float32)
+        met = np.flatnonzero(hits.face >= 0).astype(np.int32)
+        values, found = ball_run.lights[0].lookup.at_hits(scene, hits, met, own)
         shapes = np.searchsorted(scene.first_face, hits.face[met], side="right") - 1
-        np.testing.assert_allclose(values.numpy()[met, 0], shapes, rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(values.numpy()[found > 0, 0], shapes[found > 0], rtol=1e-5, atol=1e-5)
 
 
 def test_inside_of_a_sphere():
-    """In an integrating sphere the light of each pixel is that of irradiance P a / (S (1 - a)), but for what paths longer
-    than allowed would bring."""
+    """In an integrating sphere each pixel has the light of irradiance P a / (S (1 - a)), but for what longer paths than
+    are allowed would bring."""
     scene, expected = gi.scenes.integrating_sphere()
     sequence = gi.Sequence(2, lambda frame: scene)
     method = gi.PointFilter(**(FEW | {"max_depth": 24, "roulette_depth": None}))

@@ -7,6 +7,7 @@ import time
 import zipfile
 from collections import Counter
 from collections.abc import Callable
+from collections.abc import Sequence as Series
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,21 +24,18 @@ from warpgi.filter_animation import MODES
 from warpgi.fingerprint import fingerprint
 from warpgi.frame_files import FrameFiles
 from warpgi.image import atomic_write
-from warpgi.irradiance import PathSource
 from warpgi.job import Job
-from warpgi.kernels import irradiance_cache
 from warpgi.methods.path import NEVER
 from warpgi.methods.point_filter import PointFilter
+from warpgi.point_light import PointLight, lights_at
 from warpgi.progress import Progress, progress_bar
-from warpgi.reconstruction import PrimaryHits
-from warpgi.record_cache import strata
 from warpgi.render import render_scene
 from warpgi.result import Render
 from warpgi.sampling import path_settings, trace_primary_hits
 from warpgi.seeds import frame_seed
 from warpgi.sequence import Sequence
 from warpgi.statistical_filtering import FrameMatrix, Projection
-from warpgi.surface_points import PointCollector, PointLookup, SurfacePoints
+from warpgi.surface_points import PointCollector, SurfacePoints
 from warpgi.timing import Timings
 
 FORMAT = 1
@@ -126,11 +124,12 @@ class PointRun:
         with self.timings.stage("compile"):
             device.load(method.kernels)
         self.rest = DeviceScene(sequence.scene(0), device)
-        self._collector = PointCollector(self.rest, method.spacing, seed)
+        exponent = 0.0 if method.roughness is None else 1.0 / method.roughness
+        self._collector = PointCollector(self.rest, method.spacing, seed, exponent * (1.0 + 1e-6))
         pixels = size[0] * size[1] * len(numbers)
         self._rays_per_pixel = min(max(1, -(-LEAST_PLACES // pixels)), MOST_RAYS_PER_PIXEL)
         self._before = self.rest
-        self._light: dict[int, np.ndarray] = {}
+        self._values: dict[int, dict[str, np.ndarray]] = {}
         self._identities: dict[int, str] = {}
 
     def look_at(self, number: int) -> None:
@@ -148,7 +147,7 @@ class PointRun:
         """Chooses the points, once all frames were looked at."""
         with self.timings.stage("points"):
             self.points = self._collector.points()
-            self.lookup = PointLookup(self.points, self.rest)
+            self.lights = lights_at(self.points, self.rest.scene, self.rest, self.method)
         self.counts["points"] = len(self.points)
 
     def trace(self, number: int) -> None:
@@ -156,7 +155,7 @@ class PointRun:
         points, method = self.points, self.method
         seed = frame_seed(frame_seed(self.seed, number), number)  # other random numbers than the picture's
         scene = self.sequence.scene(number)
-        paths = (method.rays, method.max_depth, method.roulette_depth, method.sampler)
+        paths = (method.rays, method.roughness, method.max_depth, method.roulette_depth, method.sampler)
         where = (points.face, points.bary, points.side)
         identity = fingerprint(FORMAT, warpgi.__version__, paths, seed, scene, where)
         self._identities[number] = identity
@@ -164,23 +163,24 @@ class PointRun:
             return
         with self.timings.stage("light"):
             job = self._job(number, seed)
-            light, rays = point_light(job, points, method)
-        self.counts["point_rays"] += rays
+            values = {}
+            for light in self.lights:
+                found, rays = light.trace(job)
+                values[light.name] = np.where(np.isfinite(found), found, np.float32(0.0))
+                self.counts["point_rays"] += rays
         if self.files is None:
-            self._light[number] = light
+            self._values[number] = values
             return
         path = self._path(number)
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(path) as temporary, open(temporary, "wb") as file:
-            np.savez(file, allow_pickle=False, irradiance=light, identity=np.array(identity))
+            np.savez(file, allow_pickle=False, identity=np.array(identity), **values)
 
     def filter(self) -> None:
         """Filters the light of all frames."""
         with self.timings.stage("filter"):
-            size = (len(self.points), 1)
-            matrix = FrameMatrix(self._load, len(self.numbers), size, self.device)
-            self._projection = Projection(matrix, self.method.filter, size, self._smooth)
-        self.modes = self._projection.modes
+            self._projections = [self._projection(light) for light in self.lights]
+        self.modes = self._projections[0].modes
         identities = [self._identities[number] for number in self.numbers]
         settings = (FORMAT, warpgi.__version__, self.method, self.size, self.seed)
         self.identity = fingerprint(settings, identities, self.points.radius)
@@ -189,9 +189,9 @@ class PointRun:
         """A frame's picture by filtered light."""
         number = self.numbers[index]
         with self.timings.stage("filter"):
-            light = self._projection.frame(index).reshape(-1, 3)
+            values = self.filtered(index)
         seed = frame_seed(self.seed, number)
-        prepare = partial(FramePoints, self.method, self.lookup, light)
+        prepare = partial(FramePoints, self.method, self.lights, values)
         scene = self.sequence.scene(number)
         method: Any = self.method  # which has no way to prepare a picture alone
         picture, self._before, _ = render_scene(
@@ -201,15 +201,31 @@ class PointRun:
             self.timings[name] = self.timings.get(name, 0.0) + seconds
         return picture
 
+    def filtered(self, index: int) -> list[np.ndarray]:
+        """A frame's filtered values of each of `lights`, shape (P, width, 3), float32."""
+        found = []
+        for light, projection in zip(self.lights, self._projections, strict=True):
+            found.append(projection.frame(index).reshape(-1, light.width, 3))
+        return found
+
+    def _projection(self, light: PointLight) -> Projection:
+        """One light's principal components, a coefficient of a point in place of a pixel."""
+        count = len(light.points)
+        size = (count * light.width, 1)
+
+        def smooth(images: np.ndarray) -> np.ndarray:
+            return light.lookup.smoothed(images.reshape(count, -1)).reshape(images.shape)
+
+        matrix = FrameMatrix(partial(self._load, light.name), len(self.numbers), size, self.device)
+        signed = light.width > 1
+        return Projection(matrix, self.method.filter, size, smooth, signed)
+
     def _job(self, number: int, seed: int = 0) -> Job:
         on_device = DeviceScene(self.sequence.scene(number), self.device, self._before)
         self._before = on_device
         return Job(
             on_device, on_device.camera(self.size), self.size, seed or frame_seed(self.seed, number), self.device
         )
-
-    def _smooth(self, images: np.ndarray) -> np.ndarray:
-        return self.lookup.smoothed(images.reshape(len(self.points), -1)).reshape(images.shape)
 
     def _path(self, number: int) -> Path:
         assert self.files is not None
@@ -221,29 +237,16 @@ class PointRun:
         try:
             # numpy leaves what is no archive open
             with open(self._path(number), "rb") as file, np.load(file, allow_pickle=False) as data:
-                return str(data["identity"]) == identity and len(data["irradiance"]) == len(self.points)
+                return str(data["identity"]) == identity and all(light.name in data for light in self.lights)
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
             return False
 
-    def _load(self, index: int) -> np.ndarray:
+    def _load(self, name: str, index: int) -> np.ndarray:
         number = self.numbers[index]
         if self.files is None:
-            return self._light[number]
+            return self._values[number][name]
         with np.load(self._path(number), allow_pickle=False) as data:
-            return data["irradiance"]
-
-
-def point_light(job: Job, points: SurfacePoints, method: PointFilter) -> tuple[np.ndarray, int]:
-    """A frame's irradiance of indirect light at all points, shape (P, 3), and how many rays it took."""
-    position, normal = points.placed(job.scene)
-    none = np.zeros((0, 3), np.float32)
-    nowhere = PrimaryHits(none, none, none, 1)
-    depth, roulette = method.max_depth or NEVER, method.roulette_depth or NEVER
-    source = PathSource(job, nowhere, path_settings(job, depth - 1, roulette, method.sampler))
-    rings, sectors = strata(method.rays)
-    found = source.at_points(position, normal, np.arange(len(points), dtype=np.int32), rings, sectors)
-    value = np.where(np.isfinite(found.value), found.value, np.float32(0.0))
-    return value, source.counts["record_rays"]
+            return data[name]
 
 
 class FramePoints:
@@ -251,31 +254,26 @@ class FramePoints:
 
     Args:
         method: settings.
-        lookup: the points.
-        light: filtered irradiance at them, shape (P, 3).
+        lights: what is known at points.
+        values: it, filtered.
         job: the picture.
         film: gets all light but that of the points.
     """
 
-    def __init__(self, method: PointFilter, lookup: PointLookup, light: np.ndarray, job: Job, film: Film) -> None:
-        self.method, self._lookup, self._light = method, lookup, light
+    def __init__(
+        self, method: PointFilter, lights: Series[PointLight], values: list[np.ndarray], job: Job, film: Film
+    ) -> None:
+        self._lights, self._values = lights, values
         depth, roulette = method.max_depth or NEVER, method.roulette_depth or NEVER
         paths = path_settings(job, depth, roulette, method.sampler)
         each = max(1, method.light_samples // method.spp)
-        self.hits = trace_primary_hits(job, film, method.spp, each, paths, with_place=True)
-        self._rest = path_settings(job, depth - 1, roulette, method.sampler)
+        glossy = any(light.width > 1 for light in lights)
+        exponent = 1.0 / method.roughness * (1.0 + 1e-6) if glossy and method.roughness is not None else 0.0
+        self.hits = trace_primary_hits(job, film, method.spp, each, paths, with_place=True, exponent=exponent)
         self.reflected = job.device.zeros(len(self.hits.origin), wp.vec3)
-        self.counts = {"points": len(light), "fallback_hits": 0, "fallback_rays": 0}
+        self.counts = {"points": sum(len(light.points) for light in lights)}
 
     def look_up(self, job: Job) -> None:
         """Writes what each primary hit reflects of the points' light."""
-        device, hits = job.device, self.hits
-        irradiance, alone = self._lookup.at_hits(job.scene, hits, self._light)
-        if len(alone):
-            source = PathSource(job, hits, self._rest)
-            values = source.at_hits(alone, max(1, round(self.method.fallback_rays / hits.per_pixel)))
-            inputs = [values, device.array(alone, int)]
-            device.launch(irradiance_cache.place_irradiance, len(alone), inputs, [irradiance])
-            self.counts |= {"fallback_hits": len(alone), "fallback_rays": source.counts["fallback_rays"]}
-        inputs = [irradiance, device.array(hits.albedo, wp.vec3)]
-        device.launch(irradiance_cache.reflect_irradiance, len(hits.origin), inputs, [self.reflected])
+        for light, values in zip(self._lights, self._values, strict=True):
+            self.counts |= light.reflect(job, self.hits, values, self.reflected)

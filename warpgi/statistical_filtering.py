@@ -98,6 +98,7 @@ class Projection:
         matrix: the frames.
         settings: the filter's.
         smooth: takes images, shape (H, W, C), to their means over each pixel's surroundings on its surface.
+        signed: whether values may be below 0; else such results become 0.
     """
 
     def __init__(
@@ -106,8 +107,10 @@ class Projection:
         settings: StatisticalFilter,
         size: tuple[int, int],
         smooth: Callable[[np.ndarray], np.ndarray],
+        signed: bool = False,
     ) -> None:
         self.size, self.device = size, matrix.device
+        self._least = -3.0e38 if signed else 0.0
         gram = matrix.gram()
         values, vectors = principal_components(gram)
         limit = min(settings.modes or settings.max_modes, matrix.count)
@@ -144,7 +147,7 @@ class Projection:
         weights = np.zeros(self._basis.shape[1], np.float32)
         weights[: self.modes.count] = self._weights[index]
         result = self.device.zeros(width * height, wp.vec3)
-        inputs = [self._basis, self.device.array(weights, float), self._truncation]
+        inputs = [self._basis, self.device.array(weights, float), self._truncation, self._least]
         self.device.launch(kernels.project, width * height, inputs, [result])
         return result.numpy().reshape(height, width, 3).copy()
 

@@ -25,9 +25,6 @@ MOST_LEVELS = 24
 # Places that are looked at together; a place takes 40 bytes here and on the device.
 CHUNK = 1 << 20
 
-# Hits for which a table of points is on the device at a time; a row takes 8 bytes for each point of it.
-TABLE_HITS = 1 << 18
-
 PLACES: dict[str, Any] = {
     "face": int,
     "bary": wp.vec2,
@@ -61,6 +58,10 @@ class SurfacePoints:
     def __len__(self) -> int:
         return len(self.face)
 
+    def some(self, which: np.ndarray) -> SurfacePoints:
+        """Those of some numbers or flags."""
+        return SurfacePoints(**{name: values[which] for name, values in vars(self).items()})
+
     def placed(self, scene: DeviceScene) -> tuple[np.ndarray, np.ndarray]:
         """Positions in a frame's scene, relative to its centre, and normals, both of shape (P, 3), float32."""
         device, count = scene.device, len(self)
@@ -81,11 +82,13 @@ class PointCollector:
         rest: the scene whose distances count.
         spacing: radius of discs in pixels.
         seed: which points.
+        exponent: largest Blinn exponent of glossy surfaces that get points; 0: diffuse ones alone.
     """
 
     rest: DeviceScene
     spacing: float
     seed: int
+    exponent: float = 0.0
     _waiting: list[dict[str, np.ndarray]] = field(default_factory=list)
     _points: dict[str, np.ndarray] | None = None
 
@@ -96,7 +99,7 @@ class PointCollector:
         places = kernels.Places()
         for name, dtype in PLACES.items():
             setattr(places, name, device.zeros(count, dtype))
-        inputs = [job.scene.struct, self.rest.struct, job.camera, job.seed, rays_per_pixel]
+        inputs = [job.scene.struct, self.rest.struct, job.camera, job.seed, rays_per_pixel, self.exponent]
         device.launch(kernels.trace_places, count, inputs, [places])
         met = np.flatnonzero(places.face.numpy() >= 0)
         self._waiting.append({name: getattr(places, name).numpy()[met] for name in PLACES})
@@ -203,33 +206,32 @@ class PointLookup:
         """Means over the points around each point, shape (P, C), float32."""
         table = self._table(self.count, *self._own)
         padded = np.pad(values.astype(np.float32), ((0, 0), (0, -values.shape[1] % 3)))
-        columns = []
-        for channel in range(0, padded.shape[1], 3):
-            result, uncovered = self.device.zeros(self.count, wp.vec3), self.device.zeros(self.count, int)
-            own = self.device.array(padded[self.order, channel : channel + 3], wp.vec3)
-            self.device.launch(kernels.interpolate, self.count, [table, own, 0], [result, uncovered])
-            columns.append(result.numpy())
-        return np.concatenate(columns, axis=1)[:, : values.shape[1]]
+        width = padded.shape[1] // 3
+        own = self.device.array(padded[self.order].reshape(-1, 3), wp.vec3)
+        mixed = self.device.zeros(self.count * width, wp.vec3)
+        self.device.launch(kernels.mix_values, self.count * width, [table, width, own], [mixed])
+        return mixed.numpy().reshape(self.count, -1)[:, : values.shape[1]]
 
-    def at_hits(self, scene: DeviceScene, hits: PrimaryHits, values: np.ndarray) -> tuple[wp.array, np.ndarray]:
-        """Means of points' values, shape (P, 3), around primary hits of a frame; and numbers of hits without a point.
+    def at_hits(
+        self, scene: DeviceScene, hits: PrimaryHits, numbers: np.ndarray, values: np.ndarray
+    ) -> tuple[wp.array, np.ndarray]:
+        """Means of points' values, shape (P, C, 3), around some primary hits of a frame, by number, int32.
 
         Returns:
-            vec3 on the device, and int32 on the host.
+            Vec3 on the device, C for each, and how many points each hit has found, on the host.
         """
-        device, count = self.device, len(hits.origin)
-        result, uncovered = device.zeros(count, wp.vec3), device.zeros(count, int)
-        inputs = [device.array(hits.face, int), device.array(hits.bary, wp.vec2), device.array(hits.normal, wp.vec3)]
-        own = device.array(values[self.order], wp.vec3)
-        for first in range(0, count, TABLE_HITS):
-            some = min(TABLE_HITS, count - first)
-            position, normal = device.zeros(some, wp.vec3), device.zeros(some, wp.vec3)
-            shape = device.zeros(some, int)
-            places = [scene.struct, self.rest.struct, *inputs, first]
-            device.launch(kernels.place_hits, some, places, [position, normal, shape])
-            table = self._table(some, position, normal, shape)
-            device.launch(kernels.interpolate, some, [table, own, first], [result, uncovered])
-        return result, np.flatnonzero(uncovered.numpy()).astype(np.int32)
+        device, count, width = self.device, len(numbers), values.shape[1]
+        assert hits.face is not None and hits.bary is not None
+        own = device.array(values[self.order].reshape(-1, 3), wp.vec3)
+        position, normal = device.zeros(count, wp.vec3), device.zeros(count, wp.vec3)
+        shape, mixed = device.zeros(count, int), device.zeros(count * width, wp.vec3)
+        inputs = [device.array(hits.face[numbers], int), device.array(hits.bary[numbers], wp.vec2)]
+        inputs += [device.array(hits.normal[numbers], wp.vec3)]
+        places = [scene.struct, self.rest.struct, *inputs]
+        device.launch(kernels.place_hits, count, places, [position, normal, shape])
+        table = self._table(count, position, normal, shape)
+        device.launch(kernels.mix_values, count * width, [table, width, own], [mixed])
+        return mixed, table.count.numpy()
 
     def _table(self, count: int, position: wp.array, normal: wp.array, shape: wp.array) -> kernels.Table:
         table = kernels.Table()

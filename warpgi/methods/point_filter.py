@@ -19,12 +19,16 @@ from warpgi.kernels.light_field import add_reflected
 from warpgi.kernels.path_strata import trace_strata
 from warpgi.kernels.poisson_disc import throw_darts
 from warpgi.kernels.samples import trace_samples
+from warpgi.kernels.spherical_harmonics import project_directions
 from warpgi.methods.path import Sampler, check_paths
 from warpgi.methods.statistical_filter import StatisticalFilter
 from warpgi.sampling import PRIMARY_BYTES
 
 if TYPE_CHECKING:
     from warpgi.point_animation import FramePoints
+
+#: Below, harmonics would be too many: 300 for a lobe of this roughness.
+LEAST_ROUGHNESS = 0.005
 
 #: Device bytes of a primary hit beside those of tracing it: its place, irradiance, what it reflects, a mark.
 BYTES_PER_HIT = 12 + 2 * 12 + 4
@@ -60,6 +64,11 @@ class PointFilter:
     """Largest number that is chosen; memory grows with it."""
     per_point: bool = True
     """Choose the number for every point too, never above that of the whole: the least of bias and noise around it."""
+    roughness: float | None = 0.02
+    """Least roughness of glossy surfaces that take part, above 0: their points keep spherical harmonics, about 1.5 over
+    it of them; None: no glossy surface does."""
+    lobe_rays: int = 128
+    """Directions per pixel by which glossy surfaces ask for these."""
     light_samples: int = 32
     """Shadow rays to lights per pixel, shared out over its primary hits, which make the direct light."""
     fallback_rays: int = 64
@@ -72,9 +81,11 @@ class PointFilter:
     """Where the paths' random numbers come from."""
 
     def __post_init__(self) -> None:
-        for name in ("spp", "rays", "light_samples", "fallback_rays"):
+        for name in ("spp", "rays", "lobe_rays", "light_samples", "fallback_rays"):
             checks.count(name, getattr(self, name))
         checks.number("spacing", self.spacing, 0.0, open_lower=True)
+        if self.roughness is not None:
+            checks.number("roughness", self.roughness, LEAST_ROUGHNESS, 1.0)
         check_paths(self.max_depth, self.roulette_depth, self.sampler)
         _ = self.filter  # checks the rest
 
@@ -98,7 +109,7 @@ class PointFilter:
     def kernels(self) -> tuple[wp.Kernel, ...]:
         """What it launches: a kernel of each module."""
         points = (surface_points.trace_places, throw_darts, trace_strata, sum_strata, statistical_filter.project)
-        return (*points, bvh.fill_blocks, trace_samples, reflect_irradiance, add_reflected)
+        return (*points, bvh.fill_blocks, trace_samples, reflect_irradiance, add_reflected, project_directions)
 
     def passes(self) -> tuple[int, str]:
         """A picture is made of one lookup."""
