@@ -13,6 +13,7 @@ from rich.table import Table
 
 import warpgi as gi
 from bench.mitsuba_peer import MissingPeer
+from bench.point_animations import filtered_points
 from bench.reference import Reference, make_reference
 from bench.report import circumstances, finite, progress
 from warpgi.image import atomic_write, check_output
@@ -82,6 +83,7 @@ def run(contest: Contest, json: Path | None, picture: Path | None) -> list[Stand
         judge.standing("statistical filter", noisy_seconds + filter_seconds, smooth.stack("indirect")[judged]),
         judge.standing(f"box filter, {width} frames", noisy_seconds + box_seconds, boxed[judged]),
         *oidn(judge, noisy, noisy_seconds, device),
+        *filtered_points(judge, sequence, contest, device),
         judge.standing(f"path, {HIGH_SPP} spp", high_seconds * sequence.frames / len(judged), high.stack("indirect")),
     ]
     report(contest, sequence, standings, modes, filter_seconds / noisy_seconds)

@@ -164,8 +164,8 @@ def reflect_harmonics(
 ):
     """One thread owns one glossy hit: radiance that it reflects, from `rays` directions drawn by its BSDF.
 
-    A pixel's hits share one sequence of directions. Light that ringing makes negative is 0. `harmonics` is room for as
-    many numbers as there are coefficients.
+    A pixel's hits share one sequence of directions. Light that ringing and noise make negative counts as it is, or the
+    mean would be too large; the sum is 0 at least. `harmonics` is room for as many numbers as there are coefficients.
     """
     i = offset + wp.tid()
     h = lobes.hits[i]
@@ -182,5 +182,5 @@ def reflect_harmonics(
             light = wp.vec3(0.0)
             for j in range(start, start + count):
                 light = light + coefficients[j] * harmonics[j]
-            total = total + wp.cw_mul(b.weight, wp.max(light, wp.vec3(0.0)))
-    reflected[h] = wp.cw_mul(lobes.albedo[h], total) / float(rays)
+            total = total + wp.cw_mul(b.weight, light)
+    reflected[h] = wp.cw_mul(lobes.albedo[h], wp.max(total, wp.vec3(0.0))) / float(rays)
