@@ -45,8 +45,8 @@ def describe(sequence: gi.Sequence, method: gi.PointFilter, size: tuple[int, int
     whole = whole_count(run.points, run.rest, device)
     glossy = sum(len(light.points) for light in run.lights if light.width > 1)
     return (
-        f"{len(run.points)} points on {len(scene.shapes)} shapes, {glossy} of them glossy; all surfaces would have about"
-        f" {whole}: {max(whole - len(run.points), 0)} are hidden in all frames and not computed"
+        f"{len(run.points)} points on {len(scene.shapes)} shapes, {glossy} of them glossy; all surfaces would have"
+        f" about {whole}: {max(whole - len(run.points), 0)} are hidden in all frames and not computed"
     )
 
 
