@@ -9,9 +9,9 @@ import warpgi as gi
 from warpgi.__main__ import main
 from warpgi.animate import render_animation
 from warpgi.device_scene import DeviceScene
+from warpgi.frame_renderer import frame_seed
 from warpgi.point_animation import PointRun
 from warpgi.scenes.primitives import box, quad
-from warpgi.seeds import frame_seed
 
 SIZE = (24, 24)
 FEW = {"spp": 1, "rays": 4, "spacing": 4.0, "light_samples": 1}

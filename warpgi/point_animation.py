@@ -23,6 +23,7 @@ from warpgi.film import Film
 from warpgi.filter_animation import MODES
 from warpgi.fingerprint import fingerprint
 from warpgi.frame_files import FrameFiles
+from warpgi.frame_renderer import frame_seed
 from warpgi.image import atomic_write
 from warpgi.job import Job
 from warpgi.methods.path import NEVER
@@ -32,7 +33,6 @@ from warpgi.progress import Progress, progress_bar
 from warpgi.render import render_scene
 from warpgi.result import Render
 from warpgi.sampling import path_settings, trace_primary_hits
-from warpgi.seeds import frame_seed
 from warpgi.sequence import Sequence
 from warpgi.statistical_filtering import FrameMatrix, Projection
 from warpgi.surface_points import PointCollector, SurfacePoints
