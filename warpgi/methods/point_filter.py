@@ -54,8 +54,9 @@ class PointFilter:
     spacing: float = 3.0
     """Distance of points [pixels], in the frame that sees them largest, above 0; more blurs contact shadows, less takes
     points, and time, with its inverse square."""
-    epsilon: float = 0.005
-    """Part of the variance that may stay unexplained, in [0, 1], as for StatisticalFilter."""
+    epsilon: float = 0.0
+    """Part of the variance, the mean's included, that may stay unexplained, in [0, 1]; 0: noise alone ends the choice.
+    The paper's 0.005 loses a small moving shadow where paths are many."""
     epsilon_change: float = 0.001
     """Part of the variance that one basis function more may explain, in [0, 1]."""
     modes: int | None = None
