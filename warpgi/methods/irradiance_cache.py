@@ -57,9 +57,9 @@ class IrradianceCache:
     """Extrapolate records by their gradients."""
     fallback_rays: int = 64
     """Paths per pixel where no record serves, such as in foliage."""
-    smoothing: float = 4.0
+    smoothing: float = 0.0
     """Radius [pixels] of the filter over what is gathered hit by hit, at 16 rays a pixel; it falls with the fourth root
-    of `fallback_rays`, as their noise does. 0: none."""
+    of `fallback_rays`, as their noise does. It cleans foliage, but a thin wall does not stop it. 0: none."""
     photons: int = 0
     """Paths from the lights for photon maps, in which a record's rays end at their first hit: final gathering, with
     caustics read at the primary hits (Jensen 1996); `max_depth` is then not heeded; 0: none, paths go on."""
