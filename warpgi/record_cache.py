@@ -172,7 +172,7 @@ class RecordCache:
 
     def _smooth(self, uncovered: wp.array, rays: int, irradiance: wp.array) -> None:
         """Filters irradiance at uncovered hits, where `rays` brought it to a pixel; fewer need a wider filter."""
-        radius = self.caching.smoothing * (SMOOTHED_RAYS / max(rays, self._hits.per_pixel)) ** 0.25
+        radius = self.caching.smoothing * (SMOOTHED_RAYS / max(rays, self._hits.per_pixel)) ** 0.5
         if radius <= 0.0:
             return
         device, count = self.device, self.size[0] * self.size[1]

@@ -58,7 +58,7 @@ class IrradianceCache:
     fallback_rays: int = 64
     """Paths per pixel where no record serves, such as in foliage."""
     smoothing: float = 0.0
-    """Radius [pixels] of the filter over what is gathered hit by hit, at 16 rays a pixel; it falls with the fourth root
+    """Radius [pixels] of the filter over what is gathered hit by hit, at 16 rays a pixel; it falls with the square root
     of `fallback_rays`, as their noise does. It cleans foliage, but a thin wall does not stop it. 0: none."""
     photons: int = 0
     """Paths from the lights for photon maps, in which a record's rays end at their first hit: final gathering, with

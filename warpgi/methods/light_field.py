@@ -89,9 +89,9 @@ class LightField:
     """With `cache`: error up to which a record serves, see `IrradianceCache`."""
     scene_rays: bool = True
     """With `cache`, and where a scene is at hand: let it stop the rays of records, and splats only light them."""
-    smoothing: float = 4.0
+    smoothing: float = 3.5
     """With `cache`: radius [pixels] of the filter over what is gathered hit by hit, at 16 rays a pixel; it falls with
-    the fourth root of `rays`, as their noise does. A thin wall does not stop it. 0: none."""
+    the square root of `rays`, as their noise does. A thin wall does not stop it. 0: none."""
     record_rays: int = 256
     """With `cache`: rays of a record."""
     light_samples: int = 32
