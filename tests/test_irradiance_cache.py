@@ -239,6 +239,25 @@ def unserved(hits, light, smoothing, rays=16, device=None):
     return cache.reflected(rays).numpy()[:, 0] * np.pi
 
 
+def test_radii_by_neighbours():
+    """No record reaches farther than R_j + |x_i - x_j| of any other, and as far as that: all pairs are the judge."""
+    rng = np.random.default_rng(0)
+    count = 500
+    normals = random_normals(count, 1, spread=9.0)
+    zeros = np.zeros((count, 3, 3), np.float32)
+    points = rng.random((count, 3)).astype(np.float32)
+    radii = rng.lognormal(-2.0, 1.5, count).astype(np.float32)
+    known = Records(points, normals, radii, points, zeros, zeros)
+    caching = gi.IrradianceCache().caching
+    cache = RecordCache(gi.Device("cpu"), floor_hits(), (SIDE, SIDE), NoisyLight(radii), caching, known)
+    distance = np.linalg.norm(points[:, None].astype(np.float64) - points, axis=2)
+    expected = (radii + distance).min(axis=1)
+    assert (expected < radii).sum() > 100
+    order = cache._tree.order.numpy()
+    found = cache._kernel_records.values.numpy().reshape(-1, 24)[:, 0]
+    np.testing.assert_allclose(found, expected[order], rtol=1e-5)
+
+
 def test_filter_keeps_what_is_even_and_far():
     """Equal light stays equal, and light of one surface does not reach another that is far behind it."""
     hits = floor_hits()

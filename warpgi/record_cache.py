@@ -221,17 +221,17 @@ class RecordCache:
         positions, normals, values = (
             device.array(array, wp.vec3) for array in (records.position, records.normal, records.irradiance)
         )
-        radii, clamped = device.array(records.radius, float), device.zeros(count, float)
-        device.launch(kernels.clamp_radii, count, [positions, radii, count], [clamped])
-        radius = clamped.numpy()
         tree = SplatTree(device, positions, normals, values, np.arange(count, dtype=np.int32), self.noise)
         order = tree.order.numpy()
+        clamped = device.zeros(count, float)
+        device.launch(kernels.clamp_radii, count, [tree.struct, device.array(records.radius[order], float)], [clamped])
+        radius = clamped.numpy()
         most = caching.tolerance * caching.overlap
-        tree.set_radius2(device.array(np.square(most * radius[order]), float))
+        tree.set_radius2(device.array(np.square(most * radius), float))
         tree.refit_as_balls()
-        packed = records.packed()
+        packed = records.packed()[order]
         packed[:, 0] = radius
         struct = kernels.Records()
-        struct.tree, struct.values = tree.struct, device.array(packed[order].ravel(), float)
+        struct.tree, struct.values = tree.struct, device.array(packed.ravel(), float)
         struct.most, struct.front = most, -((FRONT / most) ** 2)
         self._tree, self._kernel_records = tree, struct  # structs do not keep their arrays alive
