@@ -187,8 +187,8 @@ def find_uncovered(
     wanted[i] = h
 
 
-# Radius of a record by its neighbours', R_i <= R_j + |x_i - x_j| (Krivanek et al. 2006). Those beyond its own radius, and
-# then beyond what is left of it, cannot make it smaller. Boxes are those of points.
+# Radius of a record by its neighbours', R_i <= R_j + |x_i - x_j| (Krivanek et al. 2006). Those beyond its own radius,
+# and then beyond what is left of it, cannot make it smaller. Boxes are those of points.
 CLAMPED = (
     LANES_HEAD
     + """

@@ -20,9 +20,9 @@ vec5 = wp.types.vector(length=5, dtype=wp.float32)
 # crevice or the next leaf.
 NEAR = wp.constant(0.5)
 
-# Radiance times weight of the splats that cover x, on a surface with normal n, the weight, and their squared radius times
-# it: a tent, as for reconstruction rays. Splats turned by more than 45 degrees, or whose plane is far, are of another surface. The tree's
-# boxes are those of balls.
+# Radiance times weight of the splats that cover x, on a surface with normal n, the weight, and their squared radius
+# times it: a tent, as for reconstruction rays. Splats turned by more than 45 degrees, or whose plane is far, are of
+# another surface. The tree's boxes are those of balls.
 COVERING = (
     "    float r = 0.0f, g = 0.0f, b = 0.0f, weight = 0.0f, square = 0.0f;\n"
     + POINT_WALK

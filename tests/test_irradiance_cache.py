@@ -279,7 +279,7 @@ def test_filter_follows_normals():
     still = unserved(hits, truth, 4.0) - truth
     assert np.std(errors - still) < 0.5 / 3
     assert abs(errors.mean()) < 4.4 * 0.5 / (2 * SIDE)
-    # what the ridge holds back of the slope: normals of pixels have a variance of 0.07 along each axis, the ridge is 0.1
+    # what the ridge of 0.1 holds back of the slope, where normals of pixels have a variance of 0.07 along each axis
     assert np.std(still) < 0.7 * truth.std()
     assert np.corrcoef(still, truth)[0, 1] < 0.0
 
