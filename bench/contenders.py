@@ -35,7 +35,7 @@ LADDERS: dict[str, tuple[Settings, ...]] = {
             (1, 20_000, 0),
             (4, 50_000, 4),
             (8, 100_000, 8),
-            (16, 200_000, 8),
+            (16, 200_000, 16),
         )
     ),
     "instant-radiosity": tuple({"paths": paths} for paths in (10, 32, 64, 256, 1024)),
@@ -70,6 +70,11 @@ CACHED_LIGHT_FIELD: tuple[Settings, ...] = tuple(
     )
 )
 
+#: Photon maps that get finer, one for every four camera paths, most of whose photons make caustics.
+PROGRESSIVE: tuple[Settings, ...] = tuple(
+    {"spp": spp, "map_spp": 4, "photons": 50_000, "caustic_photons": 200_000, "final_gather": 4} for spp in (4, 16, 64)
+)
+
 #: Few reconstruction rays whose light is filtered: samples, primary hits and rays per pixel.
 SPARSE_FILTER: tuple[Settings, ...] = (
     {"spp": 1, "rays": 4, "primary_hits": 4},
@@ -91,6 +96,7 @@ PEERS: dict[str, Callable[[], Contender]] = {
     "mitsuba llvm_ad_rgb": lambda: mitsuba("llvm_ad_rgb"),
     "oidn": oidn,
     "light-field cache": lambda: own("light-field", CACHED_LIGHT_FIELD, "light-field cache"),
+    "photon-map progressive": lambda: own("photon-map", PROGRESSIVE, "photon-map progressive"),
     "irradiance-filter sparse": lambda: own("irradiance-filter", SPARSE_FILTER, "irradiance-filter sparse"),
 }
 
