@@ -264,9 +264,9 @@ def shrink_crossed(
 # The first apparent surface along a ray, section 2.3.2: the gathered splats in front of the nearest conflict. A pair
 # conflicts where its event line meets the st plane in the positive, or in the negative, half-spaces of both (with the
 # authors' erratum); that is a b depth_i depth_j > 0 for a = (h_j - h_i).n_i and b = (h_j - h_i).n_j. Of two that face
-# to opposite sides one normal is turned, or no back would hide what lies beyond it; they do not conflict where either is
-# nearer to the other's plane than the smaller radius, as the two sides of something thin are, nor where the back is met
-# in the outer half of its radius, which juts out over the edges of closed bodies.
+# to opposite sides one normal is turned, or no back would hide what lies beyond it. They do not conflict where either
+# is nearer to the other's plane than the smaller radius, as the two sides of something thin are, nor where the back is
+# met in the outer half of its radius, which juts out over the edges of closed bodies.
 # `keep_one` and `keep_two` are squared parts of their radius that splats keep which are alone, or two, in the surface.
 # What follows finds `size` splats, of which those with t_of < limit, `inside` of them, are the surface.
 FIND_SURFACE = (
