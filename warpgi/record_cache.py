@@ -15,13 +15,12 @@ import warp as wp
 
 from warpgi.device import Device
 from warpgi.irradiance import IrradianceSource
-from warpgi.kernels import bvh
 from warpgi.kernels import irradiance_cache as kernels
 from warpgi.kernels.hemisphere import sum_strata
 from warpgi.reconstruction import NOISE_ULPS, PrimaryHits
 from warpgi.records import Records
 from warpgi.samples import NO_HIT
-from warpgi.splat_tree import SplatTree
+from warpgi.splat_tree import TREE_KERNELS, SplatTree
 
 #: Pixels between those of the coarsest grid.
 COARSEST = 32
@@ -33,7 +32,7 @@ BYTES_PER_HIT = 2 * 12 + 4
 FRONT = 0.01
 
 #: What a cache launches, to be compiled first: a kernel of each module.
-KERNELS = (kernels.interpolate, sum_strata, bvh.fill_blocks)
+KERNELS = (kernels.interpolate, sum_strata, *TREE_KERNELS)
 
 
 @dataclass(frozen=True)
