@@ -28,7 +28,7 @@ def read_order(offset: int, records: wp.array[wp.vec4], order: wp.array[int]):
     order[i] = wp.cast(records[i][3], int)
 
 
-# Hoare's selection along the longest side of the bounds: nothing before `middle` lies beyond what is after.
+# Hoare's selection (1961) along the longest side of the bounds: nothing before `middle` lies beyond what is after.
 SPLIT_AT = """
     struct Record { float at[4]; };
     Record* a = (Record*)records.data;
@@ -47,22 +47,30 @@ SPLIT_AT = """
     while (first < last) {
         const float u = a[first].at[axis], v = a[(first + last) / 2].at[axis], w = a[last].at[axis];
         const float pivot = u < v ? (v < w ? v : (u < w ? w : u)) : (u < w ? u : (v < w ? w : v));
-        int i = first, j = last;
-        do {
-            while (a[i].at[axis] < pivot)
-                ++i;
-            while (pivot < a[j].at[axis])
-                --j;
-            if (i <= j) {
+        // what is below the pivot comes first (Lomuto, without a branch, as none could be foretold)
+        int from = first;
+        for (int i = first; i <= last; ++i) {
+            const Record record = a[i];
+            a[i] = a[from];
+            a[from] = record;
+            from += record.at[axis] < pivot;
+        }
+        if (middle < from) {
+            last = from - 1;
+        } else if (first < from) {
+            first = from;
+        } else {
+            // nothing is: then what equals it
+            for (int i = first; i <= last; ++i) {
                 const Record record = a[i];
-                a[i++] = a[j];
-                a[j--] = record;
+                a[i] = a[from];
+                a[from] = record;
+                from += record.at[axis] <= pivot;
             }
-        } while (i <= j);
-        if (j < middle)
-            first = i;
-        if (middle < i)
-            last = j;
+            if (middle < from)
+                break;
+            first = from;
+        }
     }
 """
 

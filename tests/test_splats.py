@@ -11,7 +11,7 @@ from warpgi.kernels import light_field as kernels
 from warpgi.kernels.splats import SplatTree as SplatTreeStruct
 from warpgi.kernels.splats import first_surface, nearest_facing, vec10
 from warpgi.reconstruction import NOISE_ULPS
-from warpgi.splat_tree import LANES, SplatTree, compact_order, shrink_passes
+from warpgi.splat_tree import LANES, SHRINK_PASSES, SplatTree, compact_order
 
 wp.set_module_options({"enable_backward": False})
 
@@ -189,7 +189,7 @@ def test_order_halves_every_segment_across_its_longest_side(count, sorted_above)
 
 def test_every_input_ray_shrinks_in_one_pass():
     """The passes share the places of the tree out."""
-    places = np.concatenate([np.arange(first, 1000, step) for first, step in shrink_passes()])
+    places = np.concatenate([np.arange(first, 1000, step) for parts in SHRINK_PASSES for first, step in parts])
     assert sorted(places) == list(range(1000))
 
 

@@ -18,8 +18,8 @@ LANES = int(bvh.LANES)
 TREE_KERNELS = (point_order.split_segments, bvh.fill_blocks)
 SIZING_KERNELS = (neighbours.nearest_distances, kernels.size_lone_splats)
 
-# Of so many input rays one shrinks splats in the first pass: a power of two.
-FIRST_STEP = 32
+#: First place and step of the input rays that each pass of shrinking retraces: 1/16 of them, 3/16, and 3/4.
+SHRINK_PASSES = (((0, 16),), ((8, 16), (4, 8)), ((2, 4), (1, 2)))
 
 # Points above which a device with many threads halves all segments of the order at once, by sorting.
 SORTED_ABOVE = 1024
@@ -113,7 +113,7 @@ class SplatTree:
         """Shrinks what input rays cross (section 2.3.1); the same for any number of threads.
 
         A splat ends as the least of its own radius and all crossings, so that each ray may as well meet it shrunk by
-        others: every 32nd ray goes first, and what they leave is met by fewer of the rest.
+        others: a few rays go first, and what they leave is met by fewer of the rest.
         Rays that left the scene are known visibility too: `escaped` are their samples, `extent` stands for a length.
         """
         if self.count == 0:
@@ -122,10 +122,11 @@ class SplatTree:
         by_splats, by_escaped = self._shrink_kernels
         radius2 = wp.full(slots * self.count, 3.0e38, dtype=float, device=device.warp)
         device.launch(bvh.read_radii, self.count, [self.struct.blocks], [radius2[: self.count]])
-        for first, step in shrink_passes():
-            inputs = [*self._walked(), rays, margin, self.noise, first, step]
-            device.launch(by_splats, -(-(self.count - first) // step), inputs, [radius2], with_slot=True)
-            if step == 2:
+        for rays_of_pass in SHRINK_PASSES:
+            for first, step in rays_of_pass:
+                inputs = [*self._walked(), rays, margin, self.noise, first, step]
+                device.launch(by_splats, -(-(self.count - first) // step), inputs, [radius2], with_slot=True)
+            if rays_of_pass is SHRINK_PASSES[-1]:
                 inputs = [*self._walked(), rays, device.array(escaped, int), max(margin * extent, self.noise)]
                 device.launch(by_escaped, len(escaped), inputs, [radius2], with_slot=True)
             self.set_radius2(radius2, slots)
@@ -158,15 +159,6 @@ class SplatTree:
         """Gives splats new squared radii, the least of the slots, and fits the boxes to them."""
         self.device.launch(bvh.fill_radii, self.count, [radius2, slots, self.count], [self.struct.blocks])
         self.refit()
-
-
-def shrink_passes() -> list[tuple[int, int]]:
-    """First place and step of the rays of each pass, as many as all before it together; each place has its turn."""
-    passes, step = [(0, FIRST_STEP)], FIRST_STEP
-    while step > 1:
-        passes.append((step // 2, step))
-        step //= 2
-    return passes
 
 
 def compact_order(device: Device, points: wp.array, chosen: np.ndarray, sorted_above: int | None = None) -> wp.array:
