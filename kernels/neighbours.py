@@ -7,7 +7,7 @@ against all eight at once.
 import warp as wp
 
 from warpgi.kernels.lanes import LANES_HEAD
-from warpgi.kernels.splats import SplatTree
+from warpgi.kernels.splats import SEARCH_TURNS, SplatTree
 
 wp.set_module_options({"enable_backward": False})
 
@@ -29,8 +29,8 @@ NEAREST = (
             plain[8 * j + c] = -1.0f;
         }
     }
-    const float* worst = metric + 8 * want;
-    float farthest = 1.0e30f;
+    const float* kth = metric + 8 * want;
+    float worst = 1.0e30f;
     float from[3], to[3]; // bounds of the eight
     for (int axis = 0; axis < 3; ++axis) {
         from[axis] = to[axis] = q[8 * axis];
@@ -40,34 +40,9 @@ NEAREST = (
             to[axis] = larger(to[axis], x);
         }
     }
-    int stack[128];
-    float entry[128];
-    stack[0] = 0;
-    entry[0] = 0.0f;
-    int top = 1;
-    // the neighbouring blocks first: they bound the search
-    const int begin = block0 > 0 ? block0 - 1 : 0;
-    const int end = block0 + 1 < tree.block_count ? block0 + 1 : block0;
-    int next = begin;
-    while (true) {
-        int block = -1, current = 0;
-        if (next <= end) {
-            block = next++;
-        } else {
-            if (top == 0)
-                break;
-            --top;
-            if (entry[top] >= farthest)
-                continue;
-            current = stack[top];
-            if (current < 0) {
-                block = -1 - current;
-                if (block >= begin && block <= end)
-                    continue;
-            }
-        }
-        if (block >= 0) {
-            const float* p = tree.blocks.data + (size_t)block * 80;
+"""
+    + SEARCH_TURNS
+    + """
             for (int j = 0; j < 8 && p[48 + j] >= 0.0f; ++j) {
                 float d2[8], m2[8];
                 int met[8];
@@ -77,7 +52,7 @@ NEAREST = (
                     const float facing = p[24 + j] * q[24 + c] + p[32 + j] * q[32 + c] + p[40 + j] * q[40 + c];
                     d2[c] = dx * dx + dy * dy + dz * dz;
                     m2[c] = d2[c] + stretch * along * along;
-                    met[c] = (int)((d2[c] > 0.0f) & (m2[c] < worst[c]) & (facing > 0.1f));
+                    met[c] = (int)((d2[c] > 0.0f) & (m2[c] < kth[c]) & (facing > 0.1f));
                 }
                 if (lane_mask(met) == 0u)
                     continue;
@@ -99,9 +74,9 @@ NEAREST = (
                     }
                 }
             }
-            farthest = worst[0];
+            worst = kth[0];
             for (int c = 1; c < 8; ++c)
-                farthest = larger(farthest, worst[c]);
+                worst = larger(worst, kth[c]);
         } else {
             const float* p = tree.nodes.data + (size_t)current * 48;
             const int first = tree.first.data[current];
@@ -110,7 +85,7 @@ NEAREST = (
                 const float dx = larger(larger(p[j] - to[0], from[0] - p[24 + j]), 0.0f);
                 const float dy = larger(larger(p[8 + j] - to[1], from[1] - p[32 + j]), 0.0f);
                 const float dz = larger(larger(p[16 + j] - to[2], from[2] - p[40 + j]), 0.0f);
-                met[j] = (int)(dx * dx + dy * dy + dz * dz < farthest);
+                met[j] = (int)(dx * dx + dy * dy + dz * dz < worst);
             }
             const int base = top;
             unsigned mask = lane_mask(met);
@@ -131,7 +106,7 @@ NEAREST = (
                         larger(ax * nx, bx * nx) + larger(ay * ny, by * ny) + larger(az * nz, bz * nz);
                     const float along = larger(larger(low, -high), 0.0f);
                     const float least = dx * dx + dy * dy + dz * dz + stretch * along * along;
-                    bound[c] = least < worst[c] ? least : 1.0e30f;
+                    bound[c] = least < kth[c] ? least : 1.0e30f;
                 }
                 float nearest = bound[0];
                 for (int c = 1; c < 8; ++c)

@@ -22,20 +22,14 @@ class SplatTree:
     block_count: int
 
 
-# The search for what is nearest to (cx, cy, cz) in the metric |d|^2 + stretch (d.n)^2: every lane that ACCEPT takes and
-# that is nearer than `worst` is handed to KEEP, which lowers `worst`. `block0` is where to begin, -1: at the root. NODE
-# sees each node (`p`, and its `first` child) before its children, of which it enters those that ENTER takes; BLOCK sees
-# each block before its lanes.
-SEARCH_HEAD = """
-    // rows of a box's corners that lie lowest and highest along n
-    const int lx = nx < 0.0f ? 24 : 0, ly = ny < 0.0f ? 32 : 8, lz = nz < 0.0f ? 40 : 16;
-    const int hx = 24 - lx, hy = 40 - ly, hz = 56 - lz;
+# Whose turn it is in a search: the blocks about `block0` (-1: none), which bound it, then what the stack holds that
+# may be nearer than `worst`. What follows is for a block.
+SEARCH_TURNS = """
     int stack[128];
     float entry[128];
     stack[0] = 0;
     entry[0] = 0.0f;
     int top = 1;
-    // the three blocks around `block0` first: they bound the search
     const int begin = block0 > 0 ? block0 - 1 : 0;
     const int end = block0 < 0 ? -1 : (block0 + 1 < tree.block_count ? block0 + 1 : block0);
     int next = begin;
@@ -58,7 +52,20 @@ SEARCH_HEAD = """
         }
         if (block >= 0) {
             const float* p = tree.blocks.data + (size_t)block * 80;
-            BLOCK
+"""
+
+# The search for what is nearest to (cx, cy, cz) in the metric |d|^2 + stretch (d.n)^2: every lane that ACCEPT takes and
+# that is nearer than `worst` is handed to KEEP, which lowers `worst`. `block0` is where to begin, -1: at the root. NODE
+# sees each node (`p`, and its `first` child) before its children, of which it enters those that ENTER takes; BLOCK sees
+# each block before its lanes.
+SEARCH_HEAD = (
+    """
+    // rows of a box's corners that lie lowest and highest along n
+    const int lx = nx < 0.0f ? 24 : 0, ly = ny < 0.0f ? 32 : 8, lz = nz < 0.0f ? 40 : 16;
+    const int hx = 24 - lx, hy = 40 - ly, hz = 56 - lz;
+"""
+    + SEARCH_TURNS
+    + """            BLOCK
             float d2[8], m2[8];
             int met[8];
             for (int j = 0; j < 8; ++j) {
@@ -73,6 +80,7 @@ SEARCH_HEAD = """
                 const int j = next_lane(mask);
                 if (m2[j] < worst) {
 """
+)
 SEARCH_TAIL = """
                 }
             }
