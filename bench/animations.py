@@ -13,6 +13,7 @@ from rich.table import Table
 
 import warpgi as gi
 from bench.mitsuba_peer import MissingPeer
+from bench.point_animations import filtered_points
 from bench.reference import Reference, make_reference
 from bench.report import circumstances, finite, progress
 from warpgi.filter_animation import FilterRun
@@ -87,6 +88,7 @@ def run(contest: Contest, json: Path | None, picture: Path | None) -> list[Stand
         judge.standing(f"and {HIGH_SPP} spp by map", noisy_seconds + chosen_seconds, chosen),
         judge.standing(f"box filter, {width} frames", noisy_seconds + box_seconds, boxed[judged]),
         *oidn(judge, noisy, noisy_seconds, device),
+        *filtered_points(judge, sequence, contest, device),
         judge.standing("irradiance cache", cache_seconds * sequence.frames / len(judged), cache),
         judge.standing(f"path, {HIGH_SPP} spp", high_seconds * sequence.frames / len(judged), high.stack("indirect")),
     ]

@@ -54,7 +54,7 @@ METHOD_SETTINGS: Any = _subcommands(gi.METHODS)
 RECONSTRUCTIONS: Any = _subcommands(RECONSTRUCTION_METHODS)
 DENOISERS: Any = _subcommands(DENOISING_METHODS)
 SEQUENCE_SETTINGS: Any = _subcommands(gi.METHODS | SEQUENCE_METHODS)
-SEQUENCE_FILTERS: Any = _subcommands(SEQUENCE_METHODS)
+SEQUENCE_FILTERS: Any = _subcommands({"statistical-filter": gi.StatisticalFilter})
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ class AnimateCommand:
         _told(sequence.name, animation, "rendered")
         if self.preview is not None:
             shown = [animation]
-            if animation.modes is not None:
+            if isinstance(self.method, gi.StatisticalFilter):
                 path = frame_path(noisy_pattern(self.out))
                 shown.insert(0, gi.Animation([path(number) for number in animation.frames], animation.frames))
             _show(self.preview, shown, self.exposure)

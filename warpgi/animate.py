@@ -18,7 +18,8 @@ from warpgi.device import Device, as_device
 from warpgi.filter_animation import filter_frames
 from warpgi.frame_files import FrameFiles
 from warpgi.frame_renderer import FrameRenderer
-from warpgi.methods import Method, PathTracing, StatisticalFilter
+from warpgi.methods import Method, PathTracing, PointFilter, StatisticalFilter
+from warpgi.point_animation import render_points
 from warpgi.progress import Progress, progress_bar
 from warpgi.render import check_method
 from warpgi.result import Render
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
 def render_animation(
     sequence: Sequence,
-    method: Method | StatisticalFilter | None = None,
+    method: Method | StatisticalFilter | PointFilter | None = None,
     size: tuple[int, int] = (256, 256),
     seed: int = 0,
     device: str | Device | None = None,
@@ -49,7 +50,8 @@ def render_animation(
     Args:
         sequence: what to render.
         method: how, as in `render`; path tracing by default. One with `prepare_next` carries state from frame to frame.
-            `StatisticalFilter` renders noisy frames, which it keeps in a folder "noisy" beside `out`, and filters them.
+            `StatisticalFilter` renders noisy frames, which it keeps in a folder "noisy" beside `out`, and filters them;
+            `PointFilter` does the like with light at points of surfaces, for cameras and objects that move.
         size: (width, height) in pixels.
         seed: which random numbers, 0 to 2^31 - 1.
         device: "cpu", "cuda:0", a `Device`, or None for a GPU if there is one.
@@ -87,11 +89,17 @@ def render_animation(
     numbers = checked_frames(sequence, frames)
     filtered = method if isinstance(method, StatisticalFilter) else None
     estimator: Any = method if filtered is None else filtered.noisy
-    if filtered is not None and not vary_seed:
-        raise ValueError("vary_seed is False, expected True: StatisticalFilter would take equal noise for light")
-    check_method(sequence.scene(numbers[0]), estimator)
+    on_points = method if isinstance(method, PointFilter) else None
+    if (filtered is not None or on_points is not None) and not vary_seed:
+        raise ValueError(f"vary_seed is False, expected True: {type(method).__name__} would take equal noise for light")
+    if on_points is None:
+        check_method(sequence.scene(numbers[0]), estimator)
     if resume and out is None:
         raise ValueError("resume is True, expected False where out is None: there are no files to go on from")
+    if on_points is not None:
+        if cluster is not False:
+            raise ValueError("cluster is given, expected False: PointFilter renders on this machine alone")
+        return render_points(sequence, on_points, size, seed, as_device(device), progress, out, resume, numbers)
     pattern = None if out is None else noisy_pattern(out) if filtered else out
     files = None if pattern is None else FrameFiles(pattern)
     renderer = FrameRenderer(sequence, estimator, size, seed, as_device(device), vary_seed)

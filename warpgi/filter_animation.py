@@ -21,7 +21,7 @@ from warpgi.methods.statistical_filter import StatisticalFilter
 from warpgi.progress import Progress, progress_bar
 from warpgi.render import provenance
 from warpgi.result import Render
-from warpgi.statistical_filtering import FrameMatrix, Projection
+from warpgi.statistical_filtering import FrameMatrix, PixelSmoother, Projection
 from warpgi.timing import Timings
 
 if TYPE_CHECKING:
@@ -157,7 +157,8 @@ class FilterRun:
         size = (self.width, self.height)
         with self.timings.stage("filter"):
             matrix = FrameMatrix(self._load, len(noisy), size, device)
-            self._projection = Projection(matrix, method, size, self._features.means, cluster)
+            smooth = PixelSmoother(method, size, device, self._features.means)
+            self._projection = Projection(matrix, method, size, smooth, cluster=cluster)
         # reading happened in there
         self.timings["filter"] -= self.timings["read"]
         self.modes = self._projection.modes

@@ -30,6 +30,8 @@ GLOSS = (
     {"material": int, "wo": wp.vec3, "reflectance": wp.vec3},
     {"layer": int, "bandwidth": float, "base_radiance": wp.vec3},
 )
+PLACE = {"face": int, "bary": wp.vec2}  # of a primary hit on its surface
+ANY_EXPONENT = 1e30
 #: Device bytes of a primary hit, and of a secondary ray beside it.
 PRIMARY_BYTES, SECONDARY_BYTES = 12 * len(PRIMARY), 12 * len(SECONDARY + HIT_LIGHT)
 
@@ -88,12 +90,23 @@ def trace_sample_buffer(
     return SampleBuffer(job.size[0], job.size[1], spp, **values, **_projection(job)), every
 
 
-def trace_primary_hits(job: Job, film: Film, hits: int, light_samples: int, paths: PathSettings) -> PrimaryHits:
+def trace_primary_hits(
+    job: Job,
+    film: Film,
+    hits: int,
+    light_samples: int,
+    paths: PathSettings,
+    with_place: bool = False,
+    exponent: float = 0.0,
+) -> PrimaryHits:
     """Traces a picture's primary hits alone; positions stay relative to the device's origin. Direct light, and all
-    light of surfaces that are not diffuse, goes to the film."""
-    arrays = _trace(job, film, hits, 0, light_samples, paths, dict.fromkeys(PRIMARY, wp.vec3), {})
+    light of surfaces that are not diffuse, goes to the film; `with_place` tells places on surfaces, and glossy ones of
+    Blinn exponents up to `exponent` are recorded too."""
+    more: dict[str, Any] = (PLACE if with_place else {}) | (GLOSS[0] if exponent > 0.0 else {})
+    of_hits = dict.fromkeys(PRIMARY, wp.vec3) | more
+    arrays = _trace(job, film, hits, 0, light_samples, paths, of_hits, {}, exponent)
     origin, normal, albedo = (getattr(arrays, name).numpy() for name in PRIMARY)
-    return PrimaryHits(origin, normal, albedo, hits)
+    return PrimaryHits(origin, normal, albedo, hits, **{name: getattr(arrays, name).numpy() for name in more})
 
 
 def _trace(
@@ -105,11 +118,12 @@ def _trace(
     paths: PathSettings,
     of_hits: dict[str, Any],
     of_rays: dict[str, Any],
+    exponent: float = ANY_EXPONENT,
 ) -> SampleArrays:
     """Fills the named arrays of a picture's primary hits, and of its secondary rays."""
     pixels = job.size[0] * job.size[1]
     arrays = SampleArrays()
-    arrays.hits, arrays.spp = hits, spp
+    arrays.hits, arrays.spp, arrays.exponent = hits, spp, exponent
     for names, count in ((of_hits, pixels * hits), (of_rays, pixels * spp)):
         for name, dtype in names.items():
             setattr(arrays, name, job.device.zeros(count, dtype))

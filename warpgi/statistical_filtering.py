@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import cached_property
 
 import numpy as np
 import warp as wp
@@ -138,7 +139,8 @@ class Projection:
     Args:
         matrix: the frames.
         settings: the filter's.
-        features: means over the frames of the layers "normal" and "position", which say what pixels belong together.
+        smooth: takes images, shape (H, W, C), to their means over each pixel's surroundings on its surface.
+        signed: whether values may be below 0; else such results become 0.
         cluster: where frames are multiplied; None: here.
     """
 
@@ -147,10 +149,12 @@ class Projection:
         matrix: FrameMatrix,
         settings: StatisticalFilter,
         size: tuple[int, int],
-        features: Callable[[], Mapping[str, np.ndarray]],
+        smooth: Callable[[np.ndarray], np.ndarray],
+        signed: bool = False,
         cluster: Cluster | None = None,
     ) -> None:
         self.size, self.device = size, matrix.device
+        self._least = -3.0e38 if signed else 0.0
         gram = matrix.gram(cluster)
         values, vectors = principal_components(gram)
         limit = min(settings.modes or settings.max_modes, matrix.count)
@@ -168,7 +172,6 @@ class Projection:
         truncation = np.full((height, width), float(count), np.float32)
         if settings.per_pixel and count > 1 and matrix.count > count:
             variance = left / (matrix.count - count)
-            smooth = self._smoother(settings, features)
             truncation = pixel_truncation(mode_energy[..., :count], variance, smooth)
         self._weights = vectors[:, :count]
         self._truncation = self.device.array(truncation.reshape(-1), float)
@@ -188,29 +191,47 @@ class Projection:
         weights = np.zeros(self._basis.shape[1], np.float32)
         weights[: self.modes.count] = self._weights[index]
         result = self.device.zeros(width * height, wp.vec3)
-        inputs = [self._basis, self.device.array(weights, float), self._truncation]
+        inputs = [self._basis, self.device.array(weights, float), self._truncation, self._least]
         self.device.launch(kernels.project, width * height, inputs, [result])
         return result.numpy().reshape(height, width, 3).copy()
 
-    def _smoother(
-        self, settings: StatisticalFilter, features: Callable[[], Mapping[str, np.ndarray]]
-    ) -> Callable[[np.ndarray], np.ndarray]:
-        """What takes images, shape (H, W, C), to their means over each pixel's surroundings on its surface."""
-        if settings.map_radius == 0.0:
-            return lambda images: images
-        layers = features()
+
+class PixelSmoother:
+    """Means of images over each pixel's surroundings on its surface.
+
+    Args:
+        settings: the filter's.
+        size: (width, height) in pixels.
+        device: where it computes.
+        features: means over the frames of the layers "normal" and "position", which say what pixels belong together.
+    """
+
+    def __init__(
+        self,
+        settings: StatisticalFilter,
+        size: tuple[int, int],
+        device: Device,
+        features: Callable[[], Mapping[str, np.ndarray]],
+    ) -> None:
+        self._settings, self._size, self._device, self._features = settings, size, device, features
+
+    def __call__(self, images: np.ndarray) -> np.ndarray:
+        """Smooths images, shape (H, W, C)."""
+        if self._settings.map_radius == 0.0:
+            return images
+        surface, radius = self._surface
+        flat = images.reshape(len(radius), -1).astype(np.float32)
+        padded = np.pad(flat, ((0, 0), (0, -flat.shape[1] % 3)))
+        ones = np.ones((len(radius), 3), np.float32)
+        parts = [surface.run(padded[:, i : i + 3].copy(), ones, radius) for i in range(0, padded.shape[1], 3)]
+        return np.concatenate(parts, axis=1)[:, : flat.shape[1]].reshape(images.shape)
+
+    @cached_property
+    def _surface(self) -> tuple[SurfaceFilter, np.ndarray]:
+        layers, reach = self._features(), self._settings.map_radius
         rows = layer_rows({"indirect": layers["normal"]} | dict(layers), "indirect", False, True, True)
-        surface = SurfaceFilter(self.size, unit(rows.normal), rows.position, self.device, settings.map_radius, ANGLE)
-        radius = (settings.map_radius * rows.footprint()).astype(np.float32)
-
-        def smooth(images: np.ndarray) -> np.ndarray:
-            flat = images.reshape(len(radius), -1).astype(np.float32)
-            padded = np.pad(flat, ((0, 0), (0, -flat.shape[1] % 3)))
-            ones = np.ones((len(radius), 3), np.float32)
-            parts = [surface.run(padded[:, i : i + 3].copy(), ones, radius) for i in range(0, padded.shape[1], 3)]
-            return np.concatenate(parts, axis=1)[:, : flat.shape[1]].reshape(images.shape)
-
-        return smooth
+        surface = SurfaceFilter(self._size, unit(rows.normal), rows.position, self._device, reach, ANGLE)
+        return surface, (reach * rows.footprint()).astype(np.float32)
 
 
 def pixel_truncation(
