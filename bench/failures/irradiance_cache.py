@@ -51,7 +51,7 @@ def splotches_light_field(device: gi.Device) -> Value:
 
 
 def sparse_gradients(device: gi.Device) -> Value:
-    """Low-frequency error with gradients over that without, where records are few and not their noise is what is seen."""
+    """Low-frequency error with gradients over that without, where records are few and their noise is not what shows."""
     scene = gi.scenes.cornell_box()
     truth = _low(make_reference(scene, SIZE, 1024, device=device).image.astype(np.float64))
     ratios = []
