@@ -258,6 +258,7 @@ def test_mirrors_are_walked_on_from():
         ("diffuse", replace(samples, beyond=None, bandwidth=None)),
     ):
         errors[name] = gi.compare(gi.reconstruct(buffer, method).layers["indirect"], truth)["rmse"]
+    print(errors)
     assert errors["walked"] < 0.6 * min(errors["lobe"], errors["diffuse"]), errors
 
 

@@ -103,7 +103,7 @@ class LightField:
     primary_rays: bool = False
     """Reconstruct what the lens sees while the shutter is open from camera rays, not what surfaces reflect from
     secondary rays (section 3.4); the whole picture, in the layer "image", and the way to render what moves. `rays` are
-    then those of a pixel; settings that say how indirect light is gathered mean nothing. 8 neighbours do well."""
+    then those of a pixel; settings that say how indirect light is gathered mean nothing."""
 
     def __post_init__(self) -> None:
         checks.count("spp", self.spp)
