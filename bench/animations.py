@@ -13,8 +13,11 @@ from rich.table import Table
 
 import warpgi as gi
 from bench.mitsuba_peer import MissingPeer
+from bench.point_animations import filtered_points
 from bench.reference import Reference, make_reference
 from bench.report import circumstances, finite, progress
+from warpgi.filter_animation import FilterRun
+from warpgi.frame_renderer import FrameRenderer
 from warpgi.image import atomic_write, check_output
 from warpgi.metrics import RELMSE_EPSILON, RELMSE_MEAN
 from warpgi.modes import Modes
@@ -70,6 +73,8 @@ def run(contest: Contest, json: Path | None, picture: Path | None) -> list[Stand
     modes = smooth.modes
     assert modes is not None
     stack = noisy.stack("indirect")
+    chosen, chosen_seconds, average_spp = importance_sampled(sequence, noisy, judged, contest, device)
+    cache, cache_seconds = _timed_after_compile(sequence, gi.IrradianceCache(), judged, contest, device)
     high, high_seconds = _timed(
         lambda: gi.render_animation(
             sequence, gi.PathTracing(spp=HIGH_SPP), contest.size, 1, device, True, frames=judged
@@ -80,11 +85,14 @@ def run(contest: Contest, json: Path | None, picture: Path | None) -> list[Stand
     standings = [
         judge.standing(f"noisy, {contest.spp} spp", noisy_seconds, stack[judged]),
         judge.standing("statistical filter", noisy_seconds + filter_seconds, smooth.stack("indirect")[judged]),
+        judge.standing(f"and {HIGH_SPP} spp by map", noisy_seconds + chosen_seconds, chosen),
         judge.standing(f"box filter, {width} frames", noisy_seconds + box_seconds, boxed[judged]),
         *oidn(judge, noisy, noisy_seconds, device),
+        *filtered_points(judge, sequence, contest, device),
+        judge.standing("irradiance cache", cache_seconds * sequence.frames / len(judged), cache),
         judge.standing(f"path, {HIGH_SPP} spp", high_seconds * sequence.frames / len(judged), high.stack("indirect")),
     ]
-    report(contest, sequence, standings, modes, filter_seconds / noisy_seconds)
+    report(contest, sequence, standings, modes, filter_seconds / noisy_seconds, average_spp)
     if picture is not None:
         plot_modes(modes, picture)
         print(f"wrote {picture}")
@@ -95,6 +103,7 @@ def run(contest: Contest, json: Path | None, picture: Path | None) -> list[Stand
             "modes": modes.count,
             "rule": modes.rule.value,
             "mean_truncation": float(modes.truncation.mean()),
+            "average_spp": average_spp,
             "filter_seconds": filter_seconds,
             "judged_frames": judged,
         }
@@ -129,6 +138,24 @@ class Judge:
         return Standing(name, seconds, relmse, float(np.sqrt(max(np.mean(change), 0.0))))
 
 
+def importance_sampled(
+    sequence: gi.Sequence, noisy: gi.Animation, frames: list[int], contest: Contest, device: gi.Device
+) -> tuple[np.ndarray, float, float]:
+    """Judged frames of the filter with high samples where its map asks for them (MA06, sec. 3.2).
+
+    Returns:
+        Their indirect light; seconds of filter and sampling for all frames, were each as costly; average spp.
+    """
+    method = gi.StatisticalFilter(spp=contest.spp, high_spp=HIGH_SPP)
+    renderer = FrameRenderer(sequence, method.noisy, contest.size, 0, device, vary_seed=True)
+    resample = renderer.resample(method)
+    assert resample is not None
+    resample(0, np.arange(1))  # compiles
+    run, once = _timed(lambda: FilterRun(noisy, method, device, resample))
+    images, often = _timed(lambda: np.stack([run.frame(frame).layers["indirect"] for frame in frames]))
+    return images, once + often * sequence.frames / len(frames), float(run.modes.average_spp)
+
+
 def box_filter(stack: np.ndarray, width: int) -> np.ndarray:
     """Mean over `width` frames about each, as many as there are at the ends."""
     sums = np.concatenate([np.zeros_like(stack[:1], np.float64), np.cumsum(stack, axis=0, dtype=np.float64)])
@@ -156,7 +183,12 @@ def oidn(judge: Judge, noisy: gi.Animation, seconds: float, device: gi.Device) -
 
 
 def report(
-    contest: Contest, sequence: gi.Sequence, standings: Sequence[Standing], modes: Modes, filter_share: float
+    contest: Contest,
+    sequence: gi.Sequence,
+    standings: Sequence[Standing],
+    modes: Modes,
+    filter_share: float,
+    average_spp: float,
 ) -> None:
     """Prints what was found."""
     width, height = contest.size
@@ -171,7 +203,8 @@ def report(
     Console(width=100).print(table)
     print(
         f"{modes.count} modes by {modes.rule.value}, {modes.truncation.mean():.2f} in the mean over pixels;"
-        f" filtering takes {100.0 * filter_share:.1f} % of rendering"
+        f" filtering takes {100.0 * filter_share:.1f} % of rendering;"
+        f" {average_spp:.1f} spp in the mean with {HIGH_SPP} where the map asks for them"
     )
 
 
@@ -201,6 +234,16 @@ def plot_modes(modes: Modes, path: Path) -> None:
     with atomic_write(path) as temporary:
         figure.savefig(temporary, format="png", dpi=110)
     pyplot.close(figure)
+
+
+def _timed_after_compile(
+    sequence: gi.Sequence, method: gi.IrradianceCache, frames: list[int], contest: Contest, device: gi.Device
+) -> tuple[np.ndarray, float]:
+    gi.render(sequence.scene(0), method, (8, 8), 0, device)
+    animation, seconds = _timed(
+        lambda: gi.render_animation(sequence, method, contest.size, 2, device, True, frames=frames)
+    )
+    return animation.stack("indirect"), seconds
 
 
 def _timed(work: Callable[[], object]) -> tuple:

@@ -20,6 +20,7 @@ from bench.failures import (
     meshless_hierarchy,
     path,
     photon_map,
+    point_filter,
     statistical_filter,
 )
 from bench.failures.failure import Failure
@@ -36,6 +37,7 @@ FAILURES: tuple[Failure, ...] = (
     *irradiance_cache.ROWS,
     *instant_radiosity.ROWS,
     *statistical_filter.ROWS,
+    *point_filter.ROWS,
 )
 
 PASS, FAIL, OPEN = "pass", "fail", "open"

@@ -54,7 +54,7 @@ class Surfaces:
 class Beyond:
     """What mirrors show: splats of the segments after them, in a tree of their own; empty where none was met."""
 
-    mirror: wp.array[wp.vec3]  # what each splat in the tree that resolves visibility reflects as a mirror, 0: it is none
+    mirror: wp.array[wp.vec3]  # what splats in the tree that resolves visibility reflect as mirrors, 0: they are none
     tree: SplatTree
     lobes: Lobes
     sky: Sky
@@ -282,9 +282,7 @@ def look(
             seen.input = lobes.radiance[splat] * share
         if seen.mirror[0] + seen.mirror[1] + seen.mirror[2] <= 0.0:
             axis = mirrored(d, normal)
-            lobe = largest_lobe(
-                lobes.tree, lobes.axes, lobes.cones, seen.p, normal, d, axis, distance, lobes.stretch
-            )
+            lobe = largest_lobe(lobes.tree, lobes.axes, lobes.cones, seen.p, normal, d, axis, distance, lobes.stretch)
             if lobe >= 0:
                 seen.light = seen.light + splat_radiance(lobes.tree, lobe) * share
             else:

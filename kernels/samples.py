@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warpgi.kernels.bsdf import COAT, DELTA_EXPONENT, is_delta, sample
+from warpgi.kernels.bsdf import COAT, DELTA_EXPONENT, is_delta, is_wide, sample
 from warpgi.kernels.camera import Camera, shutter_time
 from warpgi.kernels.direct import add_features, direct_light, emitted, facing_normal, reflects
 from warpgi.kernels.film import Film, PathSample, add_sample
@@ -60,7 +60,11 @@ class SampleArrays:
     time: wp.array[float]  # part of the shutter's interval
     origin_motion: wp.array[wp.vec3]  # while the shutter is open
     hit_motion: wp.array[wp.vec3]
+    # where on the surface the primary hit lies; empty where nobody asked
+    face: wp.array[int]  # -1: nowhere
+    bary: wp.array[wp.vec2]
     # for glossy reconstruction; empty where nobody asked, and then surfaces that are not diffuse are not recorded
+    exponent: float  # largest Blinn exponent of those that are
     material: wp.array[int]  # number of the primary hit's shape
     wo: wp.array[wp.vec3]  # from the primary hit towards what sees it
     reflectance: wp.array[wp.vec3]  # its albedo; `albedo` is then what multiplies its BSDF
@@ -124,6 +128,9 @@ def record_receiver(
     samples.origin[place] = s.p
     samples.origin_normal[place] = n
     samples.albedo[place] = albedo
+    if samples.face.shape[0] > 0:
+        samples.face[place] = hit.face
+        samples.bary[place] = wp.vec2(hit.u, hit.v)
     if samples.wo.shape[0] > 0:
         samples.material[place] = scene.face_shapes[hit.face]
         samples.wo[place] = wo
@@ -185,6 +192,8 @@ def trace_samples(
         place = (samples.first_pixel + i) * samples.hits + index
         k = (samples.first_pixel + i) * samples.spp + index
         samples.origin[place] = wp.vec3(NO_HIT)
+        if samples.face.shape[0] > 0:
+            samples.face[place] = -1
         if index < samples.spp:
             samples.hit[k] = wp.vec3(NO_HIT)
         sampler = make_sampler(settings.seed, pixel, index, settings.sampler)
@@ -221,7 +230,7 @@ def trace_samples(
             if shape.kind != DIELECTRIC:
                 n = facing_normal(s, wo)
             delta = is_delta(shape.kind)
-            recorded = shape.kind == DIFFUSE or (samples.wo.shape[0] > 0 and not delta)
+            recorded = shape.kind == DIFFUSE or (samples.wo.shape[0] > 0 and is_wide(shape, samples.exponent))
 
             # light sampling; alone in charge of lamps where no secondary ray looks for them
             has_ray = index < samples.spp or shape.kind != DIFFUSE

@@ -73,11 +73,12 @@ def project(
     basis: wp.array2d[float],
     weights: wp.array[float],
     truncation: wp.array[float],
+    least: float,
     result: wp.array[wp.vec3],
 ):
     """One thread writes one pixel of one frame: the sum of the basis functions up to the pixel's truncation (eq. 3).
 
-    Between whole numbers of basis functions it interpolates (sec. 3.2). Radiance below 0 becomes 0.
+    Between whole numbers of basis functions it interpolates (sec. 3.2). Values below `least` become that.
     """
     i = offset + wp.tid()
     total = wp.vec3(0.0)
@@ -87,4 +88,4 @@ def project(
             break
         for c in range(3):
             total[c] = total[c] + part * weights[k] * basis[3 * i + c, k]
-    result[i] = wp.max(total, wp.vec3(0.0))
+    result[i] = wp.max(total, wp.vec3(least))

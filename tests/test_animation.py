@@ -12,7 +12,7 @@ import pytest
 
 import warpgi as gi
 from warpgi.__main__ import main
-from warpgi.animate import frame_seed
+from warpgi.frame_renderer import frame_seed
 
 SIZE = (12, 8)
 PATH = gi.PathTracing(spp=2)

@@ -6,8 +6,8 @@ from PIL import Image
 
 import warpgi as gi
 from warpgi.__main__ import main
-from warpgi.animate import frame_seed
 from warpgi.filter_animation import high_share
+from warpgi.frame_renderer import frame_seed
 from warpgi.image import to_srgb8
 from warpgi.modes import Rule, by_epsilon, noise_edges, percent_var, principal_components
 from warpgi.resampling import trace_pixels

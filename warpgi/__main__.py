@@ -16,6 +16,7 @@ import tyro
 
 import warpgi as gi
 from warpgi.animate import noisy_pattern
+from warpgi.cluster_option import ClusterOption, chosen_cluster
 from warpgi.frame_files import frame_path
 from warpgi.image import check_output
 from warpgi.load import SUFFIXES
@@ -53,7 +54,7 @@ METHOD_SETTINGS: Any = _subcommands(gi.METHODS)
 RECONSTRUCTIONS: Any = _subcommands(RECONSTRUCTION_METHODS)
 DENOISERS: Any = _subcommands(DENOISING_METHODS)
 SEQUENCE_SETTINGS: Any = _subcommands(gi.METHODS | SEQUENCE_METHODS)
-SEQUENCE_FILTERS: Any = _subcommands(SEQUENCE_METHODS)
+SEQUENCE_FILTERS: Any = _subcommands({"statistical-filter": gi.StatisticalFilter})
 
 
 @dataclass(frozen=True)
@@ -126,6 +127,8 @@ class AnimateCommand:
     """CPU threads; all by default."""
     memory_limit: float = 3.0
     """GiB that a frame's arrays may take on the device."""
+    cluster: ClusterOption = None
+    """Render frames on Dask workers: of this machine's cores, or of the scheduler at an address, as tcp://host:8786."""
 
     def run(self) -> None:
         device = _device(self.device, self.threads, self.memory_limit)
@@ -142,11 +145,12 @@ class AnimateCommand:
             self.resume,
             frames,
             self.vary_seed,
+            chosen_cluster(self.cluster),
         )
         _told(sequence.name, animation, "rendered")
         if self.preview is not None:
             shown = [animation]
-            if animation.modes is not None:
+            if isinstance(self.method, gi.StatisticalFilter):
                 path = frame_path(noisy_pattern(self.out))
                 shown.insert(0, gi.Animation([path(number) for number in animation.frames], animation.frames))
             _show(self.preview, shown, self.exposure)
@@ -176,11 +180,14 @@ class FilterCommand:
     """CPU threads; all by default."""
     memory_limit: float = 3.0
     """GiB that arrays may take; longer sequences are read several times."""
+    cluster: ClusterOption = None
+    """Multiply frames on Dask workers: of this machine's cores, or of the scheduler at an address."""
 
     def run(self) -> None:
         device = _device(self.device, self.threads, self.memory_limit)
         noisy = gi.Animation.load(self.frames)
-        animation = gi.filter_animation(noisy, self.method, device, sys.stderr.isatty(), self.out, self.resume)
+        bar, cluster = sys.stderr.isatty(), chosen_cluster(self.cluster)
+        animation = gi.filter_animation(noisy, self.method, device, bar, self.out, self.resume, cluster)
         _told(self.frames, animation, "filtered")
         if self.preview is not None:
             reference = [] if self.reference is None else [gi.Animation.load(self.reference)]
@@ -331,7 +338,7 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("warpgi: interrupted", file=sys.stderr)
         return INTERRUPTED
-    except (ValueError, TypeError, OSError) as error:
+    except (ValueError, TypeError, OSError, ImportError) as error:
         print(f"warpgi: error: {error}", file=sys.stderr)
         return MISUSE
     return 0

@@ -2,42 +2,36 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Callable, Generator, Iterable
+from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-import warpgi
 from warpgi import checks
 from warpgi.animation import Animation
+from warpgi.cluster import open_cluster
+from warpgi.cluster_frames import cluster_frames
 from warpgi.device import Device, as_device
-from warpgi.device_scene import DeviceScene
-from warpgi.film import Film
 from warpgi.filter_animation import filter_frames
-from warpgi.fingerprint import fingerprint
 from warpgi.frame_files import FrameFiles
-from warpgi.job import Job
-from warpgi.methods import Method, PathTracing, StatisticalFilter
+from warpgi.frame_renderer import FrameRenderer
+from warpgi.methods import Method, PathTracing, PointFilter, StatisticalFilter
+from warpgi.point_animation import render_points
 from warpgi.progress import Progress, progress_bar
-from warpgi.render import check_method, render_scene
-from warpgi.resampling import trace_pixels
+from warpgi.render import check_method
 from warpgi.result import Render
-from warpgi.scene import Scene
 from warpgi.sequence import Sequence
 
-FORMAT = 1
+if TYPE_CHECKING:
+    from distributed import Client
 
 
 def render_animation(
     sequence: Sequence,
-    method: Method | StatisticalFilter | None = None,
+    method: Method | StatisticalFilter | PointFilter | None = None,
     size: tuple[int, int] = (256, 256),
     seed: int = 0,
     device: str | Device | None = None,
@@ -46,6 +40,7 @@ def render_animation(
     resume: bool = False,
     frames: Iterable[int] | None = None,
     vary_seed: bool = True,
+    cluster: bool | str | Client = False,
 ) -> Animation:
     """Renders a sequence, frame after frame.
 
@@ -55,7 +50,8 @@ def render_animation(
     Args:
         sequence: what to render.
         method: how, as in `render`; path tracing by default. One with `prepare_next` carries state from frame to frame.
-            `StatisticalFilter` renders noisy frames, which it keeps in a folder "noisy" beside `out`, and filters them.
+            `StatisticalFilter` renders noisy frames, which it keeps in a folder "noisy" beside `out`, and filters them;
+            `PointFilter` does the like with light at points of surfaces, for cameras and objects that move.
         size: (width, height) in pixels.
         seed: which random numbers, 0 to 2^31 - 1.
         device: "cpu", "cuda:0", a `Device`, or None for a GPU if there is one.
@@ -65,13 +61,18 @@ def render_animation(
         frames: which frames; all by default.
         vary_seed: each frame has random numbers of its own, made of (seed, frame), so that noise differs from frame to
             frame; False gives all frames the same, so that the frames of a still sequence are equal to the last bit.
+        cluster: render frames on workers of Dask distributed, to the same last bit (`pip install warpgi[cluster]`):
+            True for processes of this machine's that share its cores, the address of a scheduler, or a
+            `distributed.Client`. The sequence is pickled with the functions in it; files are written here. A worker
+            that dies leaves its frames to others.
 
     Returns:
         The frames, with times and counts of what was rendered.
 
     Raises:
         TypeError, ValueError: an argument is wrong, or a frame's scene is; frames before it stay.
-        OSError: a file cannot be written.
+        ImportError: `cluster` is asked for and Dask distributed is not installed.
+        OSError: a file cannot be written, or the cluster cannot be reached.
         KeyboardInterrupt: Ctrl-C; files of finished frames stay.
 
     Example:
@@ -88,49 +89,76 @@ def render_animation(
     numbers = checked_frames(sequence, frames)
     filtered = method if isinstance(method, StatisticalFilter) else None
     estimator: Any = method if filtered is None else filtered.noisy
-    if filtered is not None and not vary_seed:
-        raise ValueError("vary_seed is False, expected True: StatisticalFilter would take equal noise for light")
-    check_method(sequence.scene(numbers[0]), estimator)
+    on_points = method if isinstance(method, PointFilter) else None
+    if (filtered is not None or on_points is not None) and not vary_seed:
+        raise ValueError(f"vary_seed is False, expected True: {type(method).__name__} would take equal noise for light")
+    if on_points is None:
+        check_method(sequence.scene(numbers[0]), estimator)
     if resume and out is None:
         raise ValueError("resume is True, expected False where out is None: there are no files to go on from")
+    if on_points is not None:
+        if cluster is not False:
+            raise ValueError("cluster is given, expected False: PointFilter renders on this machine alone")
+        return render_points(sequence, on_points, size, seed, as_device(device), progress, out, resume, numbers)
     pattern = None if out is None else noisy_pattern(out) if filtered else out
     files = None if pattern is None else FrameFiles(pattern)
     renderer = FrameRenderer(sequence, estimator, size, seed, as_device(device), vary_seed)
-    with progress_bar(progress) as report:
-        animation = _render_frames(renderer, numbers, files, resume, report)
-    if filtered is None:
-        return animation
-    result = filter_frames(animation, filtered, renderer.device, progress, out, resume, renderer.resample(filtered))
+    with open_cluster(cluster, renderer.device) as workers:
+        find = files.find if files and resume else _nothing
+        frames_made = (
+            _frames_here(renderer, numbers, find)
+            if workers is None
+            else cluster_frames(workers, renderer, numbers, find)
+        )
+        with closing(frames_made), progress_bar(progress) as report:
+            animation = _keep_frames(frames_made, numbers, sequence.fps, files, report)
+        if filtered is None:
+            return animation
+        resample = renderer.resample(filtered)
+        result = filter_frames(animation, filtered, renderer.device, progress, out, resume, resample, workers)
     result.timings = dict(Counter(animation.timings) + Counter(result.timings))
     return result
 
 
-def _render_frames(
-    renderer: FrameRenderer,
+def _nothing(number: int, identity: str) -> None:
+    return None
+
+
+def _frames_here(
+    renderer: FrameRenderer, numbers: tuple[int, ...], find: Callable[[int, str], Render | None]
+) -> Generator[tuple[int, str, Render, bool]]:
+    """Frames in ascending order: number, identity, picture, and whether it was rendered and not found."""
+    for number in numbers:
+        frame = renderer.open(number)
+        picture = find(number, frame.identity)
+        yield number, frame.identity, picture or renderer.render(frame), picture is None
+
+
+def _keep_frames(
+    made: Iterable[tuple[int, str, Render, bool]],
     numbers: tuple[int, ...],
+    fps: float,
     files: FrameFiles | None,
-    resume: bool,
     report: Callable[[Progress], None] | None,
 ) -> Animation:
-    sources: list[Render | Path] = []
+    """Frames as they are made, in any order, to files or into memory."""
+    sources: dict[int, Render | Path] = {}
     rendered: list[int] = []
     timings: Counter[str] = Counter()
     counts: Counter[str] = Counter()
     started = time.perf_counter()
-    for done, number in enumerate(numbers, 1):
-        frame = renderer.open(number)
-        picture = files.find(number, frame.identity) if files and resume else None
-        if picture is None:
-            picture = renderer.render(frame)
+    for number, identity, picture, is_new in made:
+        if is_new:
             rendered.append(number)
             timings.update(picture.timings)
             if files:
-                files.save(number, frame.identity, picture)
+                files.save(number, identity, picture)
         counts.update(picture.counts)
-        sources.append(picture if files is None else files.path(number))
+        sources[number] = picture if files is None else files.path(number)
         if report is not None:
-            report(Progress(done, len(numbers), "frames", time.perf_counter() - started, dict(counts)))
-    return Animation(sources, numbers, renderer.sequence.fps, dict(timings), dict(counts), tuple(rendered))
+            report(Progress(len(sources), len(numbers), "frames", time.perf_counter() - started, dict(counts)))
+    in_order = [sources[number] for number in numbers]
+    return Animation(in_order, numbers, fps, dict(timings), dict(counts), tuple(sorted(rendered)))
 
 
 def noisy_pattern(out: str | os.PathLike[str]) -> Path:
@@ -139,11 +167,6 @@ def noisy_pattern(out: str | os.PathLike[str]) -> Path:
         raise TypeError(f"out is {type(out).__name__}, expected a path such as folder/frame-{{:04d}}.exr")
     path = Path(out)
     return path.with_name("noisy") / path.name
-
-
-def frame_seed(seed: int, frame: int) -> int:
-    """The seed of one frame, 0 to 2^31 - 1: a hash, so that neighbouring frames and seeds share nothing."""
-    return int.from_bytes(hashlib.sha256(f"{seed} {frame}".encode()).digest()[:4], "little") >> 1
 
 
 def checked_frames(sequence: Sequence, frames: Iterable[int] | None) -> tuple[int, ...]:
@@ -158,88 +181,3 @@ def checked_frames(sequence: Sequence, frames: Iterable[int] | None) -> tuple[in
     if not numbers or list(numbers) != sorted(set(numbers)):
         raise ValueError(f"frames is {list(numbers)}, expected ascending numbers, at least one")
     return numbers
-
-
-@dataclass(frozen=True)
-class Frame:
-    """One frame, ready to render."""
-
-    number: int
-    scene: Scene
-    seed: int
-    identity: str
-    """Digest of all that its picture depends on."""
-
-
-class FrameRenderer:
-    """Renders frames in ascending order; triangles that do not move and a method's state go from one to the next."""
-
-    def __init__(
-        self,
-        sequence: Sequence,
-        method: Method,
-        size: tuple[int, int],
-        seed: int,
-        device: Device,
-        vary_seed: bool,
-    ) -> None:
-        self.sequence, self.method, self.size, self.seed = sequence, method, size, seed
-        self.device, self.vary_seed = device, vary_seed
-        self.carries = hasattr(method, "prepare_next")
-        self._before: DeviceScene | None = None
-        self._state: Any = None
-        self._next = 0  # the frame that `_state` is ready for
-        self._history = ""
-
-    def open(self, number: int) -> Frame:
-        """A frame's scene, seed and identity; of a method that carries state, also of the frames before it."""
-        if self.carries:
-            for earlier in range(self._next, number):
-                self._prepare(self._make(earlier))
-        return self._make(number)
-
-    def render(self, frame: Frame) -> Render:
-        """A frame's picture."""
-        check_method(frame.scene, self.method)
-        prepare = partial(self.method.prepare_next, before=self._state) if self.carries else None  # type: ignore[attr-defined]
-        picture, self._before, state = render_scene(
-            frame.scene,
-            self.method,
-            self.size,
-            frame.seed,
-            self.device,
-            before=self._before,
-            prepare=prepare,
-        )
-        if self.carries:
-            self._state, self._next, self._history = state, frame.number + 1, frame.identity
-        return picture
-
-    def resample(self, method: StatisticalFilter) -> Callable[[int, np.ndarray], np.ndarray] | None:
-        """What samples pixels of a frame anew for importance sampling; None: nothing does."""
-        if not method.high_spp:
-            return None
-        paths = PathTracing(spp=method.high_spp)
-
-        def resample(number: int, pixels: np.ndarray) -> np.ndarray:
-            # other random numbers than the noisy frame's
-            seed = frame_seed(frame_seed(self.seed, number), number)
-            return trace_pixels(self.sequence.scene(number), pixels, paths, self.size, seed, self.device)
-
-        return resample
-
-    def _make(self, number: int) -> Frame:
-        scene = self.sequence.scene(number)
-        seed = frame_seed(self.seed, number) if self.vary_seed else self.seed
-        settings = (FORMAT, warpgi.__version__, type(self.method).__name__, self.method, self.size, seed)
-        return Frame(number, scene, seed, fingerprint(settings, scene, self._history))
-
-    def _prepare(self, frame: Frame) -> None:
-        """Brings the method's state past a frame whose picture is not needed."""
-        self.device.load(self.method.kernels)
-        on_device = DeviceScene(frame.scene, self.device, self._before)
-        room = self.device.memory_limit - on_device.nbytes - self.method.device_bytes(self.size)
-        job = Job(on_device, on_device.camera(self.size), self.size, frame.seed, self.device)
-        film = Film(self.size, self.device, room)
-        self._state = self.method.prepare_next(job, film, before=self._state)  # type: ignore[attr-defined]
-        self._before, self._next, self._history = on_device, frame.number + 1, frame.identity

@@ -7,10 +7,12 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from warpgi.animation import Animation, frame_layer
+from warpgi.cluster import Cluster, open_cluster
 from warpgi.device import Device, as_device
 from warpgi.fingerprint import fingerprint
 from warpgi.frame_files import FrameFiles
@@ -19,8 +21,11 @@ from warpgi.methods.statistical_filter import StatisticalFilter
 from warpgi.progress import Progress, progress_bar
 from warpgi.render import provenance
 from warpgi.result import Render
-from warpgi.statistical_filtering import FrameMatrix, Projection
+from warpgi.statistical_filtering import FrameMatrix, PixelSmoother, Projection
 from warpgi.timing import Timings
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 # File beside the filtered frames that holds the basis functions.
 MODES = "modes.npz"
@@ -33,6 +38,7 @@ def filter_animation(
     progress: bool | Callable[[Progress], None] = False,
     out: str | os.PathLike[str] | None = None,
     resume: bool = False,
+    cluster: bool | str | Client = False,
 ) -> Animation:
     """Filters the layer "indirect" of a rendered sequence in time, or where there is none its image.
 
@@ -48,6 +54,8 @@ def filter_animation(
         out: the filtered frames' files, such as "folder/frame-{:04d}.exr"; basis functions go to modes.npz beside them.
             None keeps frames in memory.
         resume: keep filtered frames that are whole and of these very noisy ones.
+        cluster: multiply frames on workers of Dask distributed, as `render_animation` takes them; pictures are read
+            and written here.
 
     Returns:
         The frames, the filtered layer in place of its input and without "variance", which they no longer have; and
@@ -55,7 +63,8 @@ def filter_animation(
 
     Raises:
         TypeError, ValueError: an argument is wrong or a layer is missing.
-        OSError: a file cannot be written.
+        ImportError: `cluster` is asked for and Dask distributed is not installed.
+        OSError: a file cannot be written, or the cluster cannot be reached.
 
     Example:
         >>> import warpgi as gi
@@ -71,7 +80,9 @@ def filter_animation(
         raise TypeError(f"method is {type(method).__name__}, expected StatisticalFilter")
     if method.high_spp:
         raise ValueError(f"high_spp is {method.high_spp}, expected 0: there is no scene, use render_animation")
-    return filter_frames(noisy, method, as_device(device), progress, out, resume)
+    device = as_device(device)
+    with open_cluster(cluster, device) as workers:
+        return filter_frames(noisy, method, device, progress, out, resume, cluster=workers)
 
 
 #: Gives the layer of a frame, by its number, at some pixels, shape (n, 3), sampled anew.
@@ -86,12 +97,13 @@ def filter_frames(
     out: str | os.PathLike[str] | None = None,
     resume: bool = False,
     resample: Resample | None = None,
+    cluster: Cluster | None = None,
 ) -> Animation:
     """`filter_animation` with its arguments checked, and importance sampling where the scene is at hand."""
     files = None if out is None else FrameFiles(out)
     if resume and files is None:
         raise ValueError("resume is True, expected False where out is None: there are no files to go on from")
-    run = FilterRun(noisy, method, device, resample)
+    run = FilterRun(noisy, method, device, resample, cluster)
     sources: list[Render | Path] = []
     rendered: list[int] = []
     counts: Counter[str] = Counter()
@@ -125,7 +137,14 @@ class FilterRun:
         identity: digest of all that the filtered frames depend on.
     """
 
-    def __init__(self, noisy: Animation, method: StatisticalFilter, device: Device, resample: Resample | None) -> None:
+    def __init__(
+        self,
+        noisy: Animation,
+        method: StatisticalFilter,
+        device: Device,
+        resample: Resample | None,
+        cluster: Cluster | None = None,
+    ) -> None:
         self.noisy, self.method, self.device, self._resample = noisy, method, device, resample
         self.timings = Timings()
         with self.timings.stage("compile"):
@@ -138,7 +157,8 @@ class FilterRun:
         size = (self.width, self.height)
         with self.timings.stage("filter"):
             matrix = FrameMatrix(self._load, len(noisy), size, device)
-            self._projection = Projection(matrix, method, size, self._features.means)
+            smooth = PixelSmoother(method, size, device, self._features.means)
+            self._projection = Projection(matrix, method, size, smooth, cluster=cluster)
         # reading happened in there
         self.timings["filter"] -= self.timings["read"]
         self.modes = self._projection.modes

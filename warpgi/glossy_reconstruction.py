@@ -68,10 +68,10 @@ class GlossyReconstruction(Reconstruction):
         if beyond is None or not self.bandwidth:
             return struct
         nothing = np.zeros((0, 3), np.float32)
+        nowhere = PrimaryHits(nothing, nothing, nothing, 1)  # none of them gathers light
         # a mirror shows rims as they are, so splats half as many neighbours wide
         sizes = replace(self.preprocessing, neighbours=max(2, self.preprocessing.neighbours // 2))
-        # none of them gathers light
-        after = _Beyond(beyond, self.device, sizes, self.seed, PrimaryHits(*[nothing] * 3, 1))
+        after = self._after = _Beyond(beyond, self.device, sizes, self.seed, nowhere)  # kept, for its arrays
         mirror = np.zeros((len(self.samples), 3), np.float32)
         mirror[beyond.pixel_of_sample] = beyond.albedo
         struct.mirror = self.device.array(mirror[self.tree.order.numpy()], wp.vec3)
@@ -119,8 +119,8 @@ class GlossyReconstruction(Reconstruction):
         count: int,
         each: int,
     ) -> None:
-        inputs = [self.tree.struct, self.lobes, self.beyond, self.surfaces, self.sky, receivers, each, first, count, self.seed]
-        inputs += [self.noise, *self._kept_parts()]
+        inputs = [self.tree.struct, self.lobes, self.beyond, self.surfaces, self.sky, receivers, each, first, count]
+        inputs += [self.seed, self.noise, *self._kept_parts()]
         self.device.launch(kernels.reconstruct_glossy, size, inputs, [gathered])
         self.counts["reconstruction_rays"] += size * count
 

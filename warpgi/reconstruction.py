@@ -66,6 +66,10 @@ class PrimaryHits:
     """Unit vectors towards what sees them, shape (M, 3), float32."""
     reflectance: np.ndarray | None = None
     """Albedo of the material there, shape (M, 3), float32; `albedo` then multiplies the BSDF of what is not diffuse."""
+    face: np.ndarray | None = None
+    """Triangle, shape (M,), int32, -1: none; with the next one where it was asked for."""
+    bary: np.ndarray | None = None
+    """Barycentric coordinates of its first two corners, shape (M, 2), float32."""
 
 
 class Reconstruction:

@@ -60,17 +60,23 @@ class Caching:
     @property
     def rings(self) -> int:
         """Strata of the polar angle."""
-        return max(1, round(math.sqrt(self.rays / math.pi)))
+        return strata(self.rays)[0]
 
     @property
     def sectors(self) -> int:
         """Strata of the azimuth."""
-        return max(1, round(self.rays / self.rings))
+        return strata(self.rays)[1]
 
     @property
     def rounds(self) -> list[list[tuple[int, int, int]]]:
         """See `grids`."""
         return grids(COARSEST, self.finest)
+
+
+def strata(rays: int) -> tuple[int, int]:
+    """Rings and sectors of a hemisphere, about `rays` in all: pi times as many in azimuth as in the polar angle."""
+    rings = max(1, round(math.sqrt(rays / math.pi)))
+    return rings, max(1, round(rays / rings))
 
 
 def grids(coarsest: int, finest: int) -> list[list[tuple[int, int, int]]]:

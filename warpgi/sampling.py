@@ -39,6 +39,8 @@ BEYOND: dict[str, Any] = {
     "beyond_bandwidth": float,
     "beyond_base": wp.vec3,
 }
+PLACE = {"face": int, "bary": wp.vec2}  # of a primary hit on its surface
+ANY_EXPONENT = 1e30
 #: Device bytes of a primary hit, and of a secondary ray beside it.
 PRIMARY_BYTES, SECONDARY_BYTES = 12 * len(PRIMARY), 12 * len(SECONDARY + HIT_LIGHT)
 
@@ -114,12 +116,23 @@ def _beyond(values: dict[str, Any]) -> SampleBuffer | None:
     return SampleBuffer(len(arrays["mirror"]), 1, 0, pixel=met, **after, **start)
 
 
-def trace_primary_hits(job: Job, film: Film, hits: int, light_samples: int, paths: PathSettings) -> PrimaryHits:
+def trace_primary_hits(
+    job: Job,
+    film: Film,
+    hits: int,
+    light_samples: int,
+    paths: PathSettings,
+    with_place: bool = False,
+    exponent: float = 0.0,
+) -> PrimaryHits:
     """Traces a picture's primary hits alone; positions stay relative to the device's origin. Direct light, and all
-    light of surfaces that are not diffuse, goes to the film."""
-    arrays = _trace(job, film, hits, 0, light_samples, paths, dict.fromkeys(PRIMARY, wp.vec3), {})
+    light of surfaces that are not diffuse, goes to the film; `with_place` tells places on surfaces, and glossy ones of
+    Blinn exponents up to `exponent` are recorded too."""
+    more: dict[str, Any] = (PLACE if with_place else {}) | (GLOSS[0] if exponent > 0.0 else {})
+    of_hits = dict.fromkeys(PRIMARY, wp.vec3) | more
+    arrays = _trace(job, film, hits, 0, light_samples, paths, of_hits, {}, exponent)
     origin, normal, albedo = (getattr(arrays, name).numpy() for name in PRIMARY)
-    return PrimaryHits(origin, normal, albedo, hits)
+    return PrimaryHits(origin, normal, albedo, hits, **{name: getattr(arrays, name).numpy() for name in more})
 
 
 def _trace(
@@ -131,11 +144,12 @@ def _trace(
     paths: PathSettings,
     of_hits: dict[str, Any],
     of_rays: dict[str, Any],
+    exponent: float = ANY_EXPONENT,
 ) -> SampleArrays:
     """Fills the named arrays of a picture's primary hits, and of its secondary rays."""
     pixels = job.size[0] * job.size[1]
     arrays = SampleArrays()
-    arrays.hits, arrays.spp = hits, spp
+    arrays.hits, arrays.spp, arrays.exponent = hits, spp, exponent
     for names, count in ((of_hits, pixels * hits), (of_rays, pixels * spp)):
         for name, dtype in names.items():
             setattr(arrays, name, job.device.zeros(count, dtype))

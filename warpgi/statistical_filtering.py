@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from functools import cached_property
 
 import numpy as np
 import warp as wp
 
+from warpgi.cluster import Cluster, worker_device
 from warpgi.device import Device
 from warpgi.filtering import layer_rows
 from warpgi.kernels import statistical_filter as kernels
@@ -15,8 +17,8 @@ from warpgi.methods.statistical_filter import StatisticalFilter
 from warpgi.modes import Modes, Rule, by_epsilon, by_noise, principal_components
 from warpgi.samples import unit
 
-# Rows whose strips' products are on the device at a time.
-SLAB = 256 * int(kernels.STRIP)
+# Rows whose strips' products are on the device, or on their way to a worker, at a time.
+SLAB = 16 * int(kernels.STRIP)
 
 # Difference of normals [degrees] up to which pixels share their statistics.
 ANGLE = 50.0
@@ -54,8 +56,10 @@ class FrameMatrix:
             self._kept = block, array
         return array
 
-    def gram(self) -> np.ndarray:
-        """D^T D, shape (N, N), float64."""
+    def gram(self, cluster: Cluster | None = None) -> np.ndarray:
+        """D^T D, shape (N, N), float64; here or on workers, which get some rows of all frames each."""
+        if cluster is not None:
+            return self._gram_there(cluster)
         result = np.zeros((self.count, self.count))
         for i, first in enumerate(self.blocks):
             left = self.columns(first)
@@ -67,15 +71,38 @@ class FrameMatrix:
         return result
 
     def _products(self, left: wp.array, right: wp.array) -> np.ndarray:
-        a, b = left.shape[1], right.shape[1]
-        total = np.zeros((a, b, 4, 4))
+        total = np.zeros((4 * left.shape[1], 4 * right.shape[1]))
         for start in range(0, self.rows, SLAB):
-            rows = min(SLAB, self.rows - start)
-            strips = -(-rows // int(kernels.STRIP))
-            sums = self.device.zeros((strips, a, b), wp.mat44)
-            self.device.launch(kernels.multiply_strips, strips * a * b, [left, right, start, rows], [sums])
-            total += sums.numpy().reshape(strips, a, b, 4, 4).sum(axis=0, dtype=np.float64)
-        return total.transpose(0, 2, 1, 3).reshape(4 * a, 4 * b)
+            total += slab_products(self.device, left, right, start, min(SLAB, self.rows - start))
+        return total
+
+    def _gram_there(self, cluster: Cluster) -> np.ndarray:
+        place = self.device.name, self.device.memory_limit
+        total, early, following = np.zeros((self.count, self.count)), {}, 0
+        slabs = ((start, *place, values) for start, values in self._slabs())
+        for start, part in cluster.run(_slab_gram, slabs):
+            early[start] = part
+            # float64 sums in the order of the rows, whoever comes first
+            while following in early:
+                total += early.pop(following)[: self.count, : self.count]
+                following += SLAB
+        return total
+
+    def _slabs(self) -> Iterator[tuple[int, np.ndarray]]:
+        """Some rows of all frames at a time: the first one's number and values, shape (rows, columns / 4, 4)."""
+        if len(self.blocks) == 1:
+            values = self.columns(self.blocks[0]).numpy()
+            yield from ((start, values[start : start + SLAB].copy()) for start in range(0, self.rows, SLAB))
+            return
+        width = -(-self.count // 4) * 4
+        # half for the rows that are read, half for those that are on their way
+        step = max(1, self.device.memory_limit // 4 // (4 * width * SLAB)) * SLAB
+        for first in range(0, self.rows, step):
+            values = np.zeros((min(step, self.rows - first), width), np.float32)
+            for frame in range(self.count):
+                values[:, frame] = self._load(frame).reshape(-1)[first : first + step]
+            values = values.reshape(len(values), -1, 4)
+            yield from ((first + start, values[start : start + SLAB]) for start in range(0, len(values), SLAB))
 
     def basis(self, vectors: np.ndarray) -> tuple[wp.array, np.ndarray]:
         """D V on the device, shape (rows, K), and each row's squared length, shape (rows,)."""
@@ -90,13 +117,31 @@ class FrameMatrix:
         return basis, energy.numpy().astype(np.float64)
 
 
+def slab_products(device: Device, left: wp.array, right: wp.array, start: int, rows: int) -> np.ndarray:
+    """Products of all columns of two blocks over some rows, shape (columns, columns), float64."""
+    a, b = left.shape[1], right.shape[1]
+    strips = -(-rows // int(kernels.STRIP))
+    sums = device.zeros((strips, a, b), wp.mat44)
+    device.launch(kernels.multiply_strips, strips * a * b, [left, right, start, rows], [sums])
+    total = sums.numpy().reshape(strips, a, b, 4, 4).sum(axis=0, dtype=np.float64)
+    return total.transpose(0, 2, 1, 3).reshape(4 * a, 4 * b)
+
+
+def _slab_gram(name: str, memory_limit: int, values: np.ndarray) -> np.ndarray:
+    device = worker_device(name, memory_limit)
+    columns = device.array(values, wp.vec4)
+    return slab_products(device, columns, columns, 0, len(values))
+
+
 class Projection:
     """Basis functions on the device, and what any frame is in them.
 
     Args:
         matrix: the frames.
         settings: the filter's.
-        features: means over the frames of the layers "normal" and "position", which say what pixels belong together.
+        smooth: takes images, shape (H, W, C), to their means over each pixel's surroundings on its surface.
+        signed: whether values may be below 0; else such results become 0.
+        cluster: where frames are multiplied; None: here.
     """
 
     def __init__(
@@ -104,10 +149,13 @@ class Projection:
         matrix: FrameMatrix,
         settings: StatisticalFilter,
         size: tuple[int, int],
-        features: Callable[[], Mapping[str, np.ndarray]],
+        smooth: Callable[[np.ndarray], np.ndarray],
+        signed: bool = False,
+        cluster: Cluster | None = None,
     ) -> None:
         self.size, self.device = size, matrix.device
-        gram = matrix.gram()
+        self._least = -3.0e38 if signed else 0.0
+        gram = matrix.gram(cluster)
         values, vectors = principal_components(gram)
         limit = min(settings.modes or settings.max_modes, matrix.count)
         # the bound for infinitely many pixels is the lowest: no more than that will be needed
@@ -124,7 +172,6 @@ class Projection:
         truncation = np.full((height, width), float(count), np.float32)
         if settings.per_pixel and count > 1 and matrix.count > count:
             variance = left / (matrix.count - count)
-            smooth = self._smoother(settings, features)
             truncation = pixel_truncation(mode_energy[..., :count], variance, smooth)
         self._weights = vectors[:, :count]
         self._truncation = self.device.array(truncation.reshape(-1), float)
@@ -144,29 +191,47 @@ class Projection:
         weights = np.zeros(self._basis.shape[1], np.float32)
         weights[: self.modes.count] = self._weights[index]
         result = self.device.zeros(width * height, wp.vec3)
-        inputs = [self._basis, self.device.array(weights, float), self._truncation]
+        inputs = [self._basis, self.device.array(weights, float), self._truncation, self._least]
         self.device.launch(kernels.project, width * height, inputs, [result])
         return result.numpy().reshape(height, width, 3).copy()
 
-    def _smoother(
-        self, settings: StatisticalFilter, features: Callable[[], Mapping[str, np.ndarray]]
-    ) -> Callable[[np.ndarray], np.ndarray]:
-        """What takes images, shape (H, W, C), to their means over each pixel's surroundings on its surface."""
-        if settings.map_radius == 0.0:
-            return lambda images: images
-        layers = features()
+
+class PixelSmoother:
+    """Means of images over each pixel's surroundings on its surface.
+
+    Args:
+        settings: the filter's.
+        size: (width, height) in pixels.
+        device: where it computes.
+        features: means over the frames of the layers "normal" and "position", which say what pixels belong together.
+    """
+
+    def __init__(
+        self,
+        settings: StatisticalFilter,
+        size: tuple[int, int],
+        device: Device,
+        features: Callable[[], Mapping[str, np.ndarray]],
+    ) -> None:
+        self._settings, self._size, self._device, self._features = settings, size, device, features
+
+    def __call__(self, images: np.ndarray) -> np.ndarray:
+        """Smooths images, shape (H, W, C)."""
+        if self._settings.map_radius == 0.0:
+            return images
+        surface, radius = self._surface
+        flat = images.reshape(len(radius), -1).astype(np.float32)
+        padded = np.pad(flat, ((0, 0), (0, -flat.shape[1] % 3)))
+        ones = np.ones((len(radius), 3), np.float32)
+        parts = [surface.run(padded[:, i : i + 3].copy(), ones, radius) for i in range(0, padded.shape[1], 3)]
+        return np.concatenate(parts, axis=1)[:, : flat.shape[1]].reshape(images.shape)
+
+    @cached_property
+    def _surface(self) -> tuple[SurfaceFilter, np.ndarray]:
+        layers, reach = self._features(), self._settings.map_radius
         rows = layer_rows({"indirect": layers["normal"]} | dict(layers), "indirect", False, True, True)
-        surface = SurfaceFilter(self.size, unit(rows.normal), rows.position, self.device, settings.map_radius, ANGLE)
-        radius = (settings.map_radius * rows.footprint()).astype(np.float32)
-
-        def smooth(images: np.ndarray) -> np.ndarray:
-            flat = images.reshape(len(radius), -1).astype(np.float32)
-            padded = np.pad(flat, ((0, 0), (0, -flat.shape[1] % 3)))
-            ones = np.ones((len(radius), 3), np.float32)
-            parts = [surface.run(padded[:, i : i + 3].copy(), ones, radius) for i in range(0, padded.shape[1], 3)]
-            return np.concatenate(parts, axis=1)[:, : flat.shape[1]].reshape(images.shape)
-
-        return smooth
+        surface = SurfaceFilter(self._size, unit(rows.normal), rows.position, self._device, reach, ANGLE)
+        return surface, (reach * rows.footprint()).astype(np.float32)
 
 
 def pixel_truncation(

@@ -16,6 +16,7 @@ from warpgi.methods.light_field import LightField
 from warpgi.methods.meshless_hierarchy import MeshlessHierarchy
 from warpgi.methods.path import PathTracing, Sampler
 from warpgi.methods.photon_map import Kernel, PhotonMap
+from warpgi.methods.point_filter import PointFilter
 from warpgi.methods.random_parameter_filter import RandomParameterFilter
 from warpgi.methods.statistical_filter import StatisticalFilter
 from warpgi.methods.temporal_light_field import TemporalLightField
@@ -85,7 +86,7 @@ METHODS: dict[str, type] = {
 }
 
 #: Methods of whole sequences, which `render_animation` takes and `render` does not.
-SEQUENCE_METHODS: dict[str, type] = {"statistical-filter": StatisticalFilter}
+SEQUENCE_METHODS: dict[str, type] = {"statistical-filter": StatisticalFilter, "point-filter": PointFilter}
 
 #: Those that make a picture of a sample buffer alone, and those that filter the layers of a finished one.
 RECONSTRUCTIONS = {name: kind for name, kind in METHODS.items() if hasattr(kind, "layers")}
@@ -109,6 +110,7 @@ __all__ = [
     "NearLight",
     "PathTracing",
     "PhotonMap",
+    "PointFilter",
     "RandomParameterFilter",
     "Sampler",
     "StatisticalFilter",

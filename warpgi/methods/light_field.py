@@ -49,7 +49,8 @@ AnyReconstruction = Reconstruction | CachedReconstruction | LensReconstruction
 class LightField:
     """Indirect light reconstructed from a few path-traced samples per pixel (Lehtinen et al. 2012).
 
-    Reconstructs what diffuse and glossy surfaces reflect; mirrors and glass keep their path-traced light.
+    Reconstructs what diffuse and glossy surfaces reflect; mirrors and glass keep their path-traced light. Where
+    secondary rays meet mirrors, light is reconstructed at the next segment of the path.
     `gi.reconstruct` uses it on a sample buffer alone, where the fields that say how samples are traced mean nothing.
 
     Raises:
