@@ -32,8 +32,8 @@ class GlossyReconstruction(Reconstruction):
 
     Splats of glossy surfaces resolve visibility, and give the light of diffuse layers, as all splats do. Light of
     glossy layers comes from the lobe whose filter is largest, by the share that glossy splats have in the surface met:
-    where glossy and diffuse splats overlap, as in a corner, each kind answers by its weight. On `statuettes` (320x180, 8
-    spp) two hierarchies reconstruct 1.5 times as fast as one whose splats have their lobes' sizes, at the same error.
+    where glossy and diffuse splats overlap, as in a corner, each kind answers by its weight. On `statuettes` (320x180,
+    8 spp) two hierarchies reconstruct 1.5 times as fast as one whose splats have their lobes' sizes, at the same error.
 
     Args:
         bandwidth: False reads secondary hits as if all were diffuse.
