@@ -52,7 +52,8 @@ AnyReconstruction = Reconstruction | CachedReconstruction | LensReconstruction
 class LightField:
     """Indirect light reconstructed from a few path-traced samples per pixel (Lehtinen et al. 2012).
 
-    Reconstructs what diffuse and glossy surfaces reflect; mirrors and glass keep their path-traced light.
+    Reconstructs what diffuse and glossy surfaces reflect; mirrors and glass keep their path-traced light. Where
+    secondary rays meet mirrors, light is reconstructed at the next segment of the path.
     `gi.reconstruct` uses it on a sample buffer alone, where the fields that say how samples are traced mean nothing.
 
     Raises:
@@ -109,7 +110,7 @@ class LightField:
     primary_rays: bool = False
     """Reconstruct what the lens sees while the shutter is open from camera rays, not what surfaces reflect from
     secondary rays (section 3.4); the whole picture, in the layer "image", and the way to render what moves. `rays` are
-    then those of a pixel; settings that say how indirect light is gathered mean nothing. 8 neighbours do well."""
+    then those of a pixel; settings that say how indirect light is gathered mean nothing."""
 
     def __post_init__(self) -> None:
         checks.count("spp", self.spp)
