@@ -52,17 +52,21 @@ LADDERS: dict[str, tuple[Settings, ...]] = {
     ),
 }
 
-#: The same with an irradiance cache: samples, primary hits and rays per pixel, and rays of a record.
+#: The same with an irradiance cache: samples, primary hits and rays per pixel, rays of a record, and recursions, which
+#: tell on smooth surfaces alone.
 CACHED_LIGHT_FIELD: tuple[Settings, ...] = tuple(
     {"spp": spp, "primary_hits": hits, "light_samples": hits, "rays": rays, "record_rays": record, "cache": True}
-    | {"recursive": 1, "recursive_rays": 4, "tolerance": 0.3}
-    for spp, hits, rays, record in (
-        (1, 2, 16, 64),
-        (1, 4, 32, 128),
-        (1, 8, 64, 256),
-        (1, 8, 64, 1024),
-        (2, 8, 128, 1024),
-        (4, 16, 256, 2048),
+    | {"recursive": recursions, "recursive_rays": 4, "tolerance": 0.3}
+    for spp, hits, rays, record, recursions in (
+        (1, 2, 2, 64, 0),
+        (1, 4, 4, 64, 0),
+        (1, 4, 4, 128, 1),
+        (1, 8, 8, 128, 0),
+        (1, 8, 16, 256, 1),
+        (1, 16, 16, 256, 0),
+        (1, 8, 64, 1024, 1),
+        (2, 16, 64, 1024, 1),
+        (4, 16, 256, 2048, 1),
     )
 )
 

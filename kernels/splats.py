@@ -10,8 +10,6 @@ from warpgi.kernels.lanes import LANES_HEAD
 
 wp.set_module_options({"enable_backward": False})
 
-MAX_NEIGHBOURS = 32  # the length of the arrays in NEAREST
-
 vec10 = wp.types.vector(length=10, dtype=wp.float32)
 
 
@@ -24,17 +22,14 @@ class SplatTree:
     block_count: int
 
 
-# The search for what is nearest to (cx, cy, cz) in the metric |d|^2 + stretch (d.n)^2: every lane that ACCEPT takes and
-# that is nearer than `worst` is handed to KEEP, which lowers `worst`. `block0` is where to begin, -1: at the root. NODE
-# sees each node (`p`, and its `first` child) before its children, of which it enters those that ENTER takes; BLOCK sees
-# each block before its lanes.
-SEARCH_HEAD = """
+# Whose turn it is in a search: the blocks about `block0` (-1: none), which bound it, then what the stack holds that
+# may be nearer than `worst`. What follows is for a block.
+SEARCH_TURNS = """
     int stack[128];
     float entry[128];
     stack[0] = 0;
     entry[0] = 0.0f;
     int top = 1;
-    // the three blocks around `block0` first: they bound the search
     const int begin = block0 > 0 ? block0 - 1 : 0;
     const int end = block0 < 0 ? -1 : (block0 + 1 < tree.block_count ? block0 + 1 : block0);
     int next = begin;
@@ -57,7 +52,20 @@ SEARCH_HEAD = """
         }
         if (block >= 0) {
             const float* p = tree.blocks.data + (size_t)block * 80;
-            BLOCK
+"""
+
+# The search for what is nearest to (cx, cy, cz) in the metric |d|^2 + stretch (d.n)^2: every lane that ACCEPT takes and
+# that is nearer than `worst` is handed to KEEP, which lowers `worst`. `block0` is where to begin, -1: at the root. NODE
+# sees each node (`p`, and its `first` child) before its children, of which it enters those that ENTER takes; BLOCK sees
+# each block before its lanes.
+SEARCH_HEAD = (
+    """
+    // rows of a box's corners that lie lowest and highest along n
+    const int lx = nx < 0.0f ? 24 : 0, ly = ny < 0.0f ? 32 : 8, lz = nz < 0.0f ? 40 : 16;
+    const int hx = 24 - lx, hy = 40 - ly, hz = 56 - lz;
+"""
+    + SEARCH_TURNS
+    + """            BLOCK
             float d2[8], m2[8];
             int met[8];
             for (int j = 0; j < 8; ++j) {
@@ -72,6 +80,7 @@ SEARCH_HEAD = """
                 const int j = next_lane(mask);
                 if (m2[j] < worst) {
 """
+)
 SEARCH_TAIL = """
                 }
             }
@@ -79,26 +88,31 @@ SEARCH_TAIL = """
             const float* p = tree.nodes.data + (size_t)current * 48;
             const int first = tree.first.data[current];
             NODE
-            float d2[8];
+            float d2[8], m2[8];
             int met[8];
             for (int j = 0; j < 8; ++j) {
                 const float dx = larger(larger(p[j] - cx, cx - p[24 + j]), 0.0f);
                 const float dy = larger(larger(p[8 + j] - cy, cy - p[32 + j]), 0.0f);
                 const float dz = larger(larger(p[16 + j] - cz, cz - p[40 + j]), 0.0f);
                 d2[j] = dx * dx + dy * dy + dz * dz;
-                met[j] = (int)((d2[j] < worst)ENTER);
+                // no corner of the box lies deeper below the plane, or higher above it, than these
+                const float low = (p[lx + j] - cx) * nx + (p[ly + j] - cy) * ny + (p[lz + j] - cz) * nz;
+                const float high = (p[hx + j] - cx) * nx + (p[hy + j] - cy) * ny + (p[hz + j] - cz) * nz;
+                const float along = larger(larger(low, -high), 0.0f);
+                m2[j] = d2[j] + stretch * along * along;
+                met[j] = (int)((m2[j] < worst)ENTER);
             }
             const int base = top;
             unsigned mask = lane_mask(met);
             while (mask) {
                 const int j = next_lane(mask);
                 int slot = top++;
-                while (slot > base && entry[slot - 1] < d2[j]) {
+                while (slot > base && entry[slot - 1] < m2[j]) {
                     entry[slot] = entry[slot - 1];
                     stack[slot] = stack[slot - 1];
                     --slot;
                 }
-                entry[slot] = d2[j];
+                entry[slot] = m2[j];
                 stack[slot] = first >= 0 ? first + j : first - j;
             }
         }
@@ -113,43 +127,6 @@ def search(keep: str, accept: str = "", node: str = "", enter: str = "", block: 
     for name, code in (("ACCEPT", accept), ("BLOCK", block), ("NODE", node), ("ENTER", enter)):
         head, tail = head.replace(name, code), tail.replace(name, code)
     return head + keep + tail
-
-
-# Squared distance to the k-th neighbour in that metric, the sample itself counted, and in Euclid's; samples at the
-# very same place are not neighbours, or they would vanish, nor are those that face elsewhere: they are of another
-# surface, or of the other side of something thin.
-NEAREST = (
-    LANES_HEAD
-    + """
-    const int block0 = i / 8;
-    const float* q = tree.blocks.data + (size_t)block0 * 80 + i % 8;
-    const float cx = q[0], cy = q[8], cz = q[16], nx = q[24], ny = q[32], nz = q[40];
-    const int want = k - 1;
-    float metric[32], plain[32];
-    int found = 0;
-    float worst = 1.0e30f;
-"""
-    + search(
-        """
-                    int slot = found < want ? found++ : want - 1;
-                    while (slot > 0 && metric[slot - 1] > m2[j]) {
-                        metric[slot] = metric[slot - 1];
-                        plain[slot] = plain[slot - 1];
-                        --slot;
-                    }
-                    metric[slot] = m2[j];
-                    plain[slot] = d2[j];
-                    if (found == want)
-                        worst = metric[want - 1];
-""",
-        accept=" & (p[24 + j] * nx + p[32 + j] * ny + p[40 + j] * nz > 0.1f)",
-    )
-    + "    return found > 0 ? plain[found - 1] : -1.0f;\n"
-)
-
-
-@wp.func_native(NEAREST)
-def nearest_distance2(tree: SplatTree, i: int, k: int, stretch: float) -> float: ...
 
 
 # Walks the boxes along a ray and hands each block that it meets beyond `start` and before `limit` on, nearest first.
@@ -263,15 +240,18 @@ def shrink_crossed(
 
 # The first apparent surface along a ray, section 2.3.2: the gathered splats in front of the nearest conflict. A pair
 # conflicts where its event line meets the st plane in the positive, or in the negative, half-spaces of both (with the
-# authors' erratum); that is a b depth_i depth_j > 0 for a = (h_j - h_i).n_i and b = (h_j - h_i).n_j.
+# authors' erratum); that is a b depth_i depth_j > 0 for a = (h_j - h_i).n_i and b = (h_j - h_i).n_j. Of two that face
+# to opposite sides one normal is turned, or no back would hide what lies beyond it. They do not conflict where either
+# is nearer to the other's plane than the smaller radius, as the two sides of something thin are, nor where the back is
+# met in the outer half of its radius, which juts out over the edges of closed bodies.
 # `keep_one` and `keep_two` are squared parts of their radius that splats keep which are alone, or two, in the surface.
 # What follows finds `size` splats, of which those with t_of < limit, `inside` of them, are the surface.
 FIND_SURFACE = (
     WALK_HEAD
     + """
-    float hx[72], hy[72], hz[72], gx[72], gy[72], gz[72], depth[72], t_of[72], e_of[72];
+    float hx[72], hy[72], hz[72], gx[72], gy[72], gz[72], depth[72], side[72], t_of[72], e_of[72];
     for (int j = 0; j < 72; ++j)
-        hx[j] = hy[j] = hz[j] = gx[j] = gy[j] = gz[j] = depth[j] = 0.0f;
+        hx[j] = hy[j] = hz[j] = gx[j] = gy[j] = gz[j] = depth[j] = side[j] = e_of[j] = 0.0f;
     const float start = 0.0f, slack_noise2 = 16.0f * noise * noise;
     int place[64];
     int passed[16];
@@ -319,8 +299,8 @@ FIND_SURFACE = (
                         if (t_of[j] < limit) {
                             hx[kept] = hx[j]; hy[kept] = hy[j]; hz[kept] = hz[j];
                             gx[kept] = gx[j]; gy[kept] = gy[j]; gz[kept] = gz[j];
-                            depth[kept] = depth[j]; t_of[kept] = t_of[j]; e_of[kept] = e_of[j];
-                            place[kept] = place[j];
+                            depth[kept] = depth[j]; side[kept] = side[j]; t_of[kept] = t_of[j];
+                            e_of[kept] = e_of[j]; place[kept] = place[j];
                             farthest = t_of[kept] > t_of[farthest] ? kept : farthest;
                             ++kept;
                         }
@@ -334,13 +314,14 @@ FIND_SURFACE = (
                         --size;
                         hx[farthest] = hx[size]; hy[farthest] = hy[size]; hz[farthest] = hz[size];
                         gx[farthest] = gx[size]; gy[farthest] = gy[size]; gz[farthest] = gz[size];
-                        depth[farthest] = depth[size]; t_of[farthest] = t_of[size]; e_of[farthest] = e_of[size];
-                        place[farthest] = place[size];
+                        depth[farthest] = depth[size]; side[farthest] = side[size]; t_of[farthest] = t_of[size];
+                        e_of[farthest] = e_of[size]; place[farthest] = place[size];
                     }
                 }
                 const float px = p[k], py = p[8 + k], pz = p[16 + k];
                 const float nx = p[24 + k], ny = p[32 + k], nz = p[40 + k];
-                const float far = along[k];
+                const float far = along[k], e = e2[k] / p[48 + k];
+                const float turned = facing[k] < 0.0f ? p[48 + k] : -p[48 + k];
                 // eight at a time; lanes past the end hold old samples whose t is put beyond any limit
                 float first_conflict[8];
                 for (int c = 0; c < 8; ++c)
@@ -355,8 +336,12 @@ FIND_SURFACE = (
                         const float a = dx * gx[j + c] + dy * gy[j + c] + dz * gz[j + c];
                         const float b = dx * nx + dy * ny + dz * nz;
                         const float slack2 = 1.0e-4f * (dx * dx + dy * dy + dz * dz) + slack_noise2;
-                        const bool conflict =
-                            (a * b * (depth[j + c] * far) > 0.0f) & (a * a > slack2) & (b * b > slack2);
+                        const bool same_side = (side[j + c] > 0.0f) == (turned > 0.0f);
+                        const float thick2 = smaller(wp::abs(side[j + c]), wp::abs(turned));
+                        const float least2 = same_side ? slack2 : larger(slack2, thick2);
+                        const bool inner = same_side | ((turned > 0.0f ? e_of[j + c] : e) < 0.25f);
+                        const bool conflict = ((a * b * (depth[j + c] * far) > 0.0f) == same_side) & (a * a > least2) &
+                            (b * b > least2) & inner;
                         const float both = larger(t_of[j + c], t[k]);
                         first_conflict[c] = smaller(first_conflict[c], conflict ? both : 1.0e30f);
                     }
@@ -365,8 +350,8 @@ FIND_SURFACE = (
                     limit = smaller(limit, first_conflict[c]);
                 hx[size] = px; hy[size] = py; hz[size] = pz;
                 gx[size] = nx; gy[size] = ny; gz[size] = nz;
-                depth[size] = far; t_of[size] = t[k];
-                e_of[size] = e2[k] / p[48 + k];
+                depth[size] = far; side[size] = turned; t_of[size] = t[k];
+                e_of[size] = e;
                 place[size] = facing[k] < 0.0f ? splat : -1 - splat;
                 ++size;
             }

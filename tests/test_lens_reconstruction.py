@@ -15,7 +15,7 @@ from warpgi.temporal_reconstruction import TemporalReconstruction
 FACES = [(0, 1, 2), (0, 2, 3)]
 SQUARE = np.array([(-1.0, -1.0, 0.0), (1.0, -1.0, 0.0), (1.0, 1.0, 0.0), (-1.0, 1.0, 0.0)])
 METHODS = {
-    "light-field": gi.LightField(spp=1, rays=64, neighbours=8, primary_rays=True),
+    "light-field": gi.LightField(spp=1, rays=64, primary_rays=True),
     "temporal-light-field": gi.TemporalLightField(spp=1, rays=64),
 }
 SIZE = (48, 32)
@@ -69,7 +69,7 @@ def reconstruct(samples, kind, rays=8):
     if kind == "temporal":
         state = TemporalReconstruction(samples, device, 3, 1.8)
     else:
-        state = LensReconstruction(samples, device, Preprocessing(8, 3.0, 1e-3, 1.0), 3)
+        state = LensReconstruction(samples, device, Preprocessing(12, 3.0, 1e-3, 1.0), 3)
     state.gather(0, rays, rays)
     return state.image()
 
@@ -185,7 +185,8 @@ def test_the_sky_behind_is_kept(method):
     image = gi.render(scene, method, size=SIZE).image
     expected = gi.render(scene, gi.PathTracing(spp=512, max_depth=1), size=SIZE).image
     assert image.mean() == pytest.approx(expected.mean(), rel=0.03)
-    assert np.allclose(image[:, -6:], (0.2, 0.4, 0.9), rtol=1e-4)
+    # out of the reach of samples at the layer's rim
+    assert np.allclose(image[:, -5:], (0.2, 0.4, 0.9), rtol=1e-4)
 
 
 def test_radius_of_the_earlier_method_is_the_patterns_dispersion():

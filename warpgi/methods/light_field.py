@@ -12,15 +12,14 @@ import warp as wp
 from warpgi import checks
 from warpgi.cached_reconstruction import CachedReconstruction
 from warpgi.device import Device
-from warpgi.device_scene import DeviceScene
 from warpgi.film import Film
 from warpgi.glossy_reconstruction import GlossyReconstruction
 from warpgi.irradiance import STRATA_BYTES
 from warpgi.job import Job
 from warpgi.kernels.light_field import add_reflected
+from warpgi.kernels.neighbours import MAX_NEIGHBOURS
 from warpgi.kernels.primary_samples import trace_primary_samples
 from warpgi.kernels.samples import trace_samples
-from warpgi.kernels.splats import MAX_NEIGHBOURS
 from warpgi.lens_reconstruction import PRIMARY_SAMPLE_BYTES, LensReconstruction
 from warpgi.methods.irradiance_cache import IrradianceCache
 from warpgi.methods.path import NEVER, Sampler, check_paths
@@ -38,9 +37,13 @@ from warpgi.record_cache import BYTES_PER_HIT as CACHE_BYTES_PER_HIT
 from warpgi.record_cache import KERNELS as CACHE_KERNELS
 from warpgi.record_cache import Caching
 from warpgi.samples import SampleBuffer
-from warpgi.sampling import PRIMARY_BYTES, SECONDARY_BYTES, trace_primary_buffer, trace_sample_buffer
+from warpgi.sampling import PRIMARY_BYTES, SECONDARY_BYTES, path_settings, trace_primary_buffer, trace_sample_buffer
 from warpgi.traced_reconstruction import KERNELS as TRACED_KERNELS
 from warpgi.traced_reconstruction import TracedReconstruction
+
+# Points of a pixel that make its edges, textures and foliage smooth, while this many rays are left to each.
+SMOOTH_HITS = 16
+FEWEST_RAYS = 8
 
 AnyReconstruction = Reconstruction | CachedReconstruction | LensReconstruction
 
@@ -49,7 +52,8 @@ AnyReconstruction = Reconstruction | CachedReconstruction | LensReconstruction
 class LightField:
     """Indirect light reconstructed from a few path-traced samples per pixel (Lehtinen et al. 2012).
 
-    Reconstructs what diffuse and glossy surfaces reflect; mirrors and glass keep their path-traced light.
+    Reconstructs what diffuse and glossy surfaces reflect; mirrors and glass keep their path-traced light. Where
+    secondary rays meet mirrors, light is reconstructed at the next segment of the path.
     `gi.reconstruct` uses it on a sample buffer alone, where the fields that say how samples are traced mean nothing.
 
     Raises:
@@ -78,8 +82,8 @@ class LightField:
     recursive_rays: int = 16
     """Reconstruction rays for each sample in that step."""
     primary_hits: int | None = None
-    """Primary hits per pixel at which light is gathered, `spp` or more; None is `spp`. More of them make smooth edges,
-    textures and foliage, for the cost of a camera ray each."""
+    """Primary hits per pixel at which light is gathered, `spp` or more. More of them make smooth edges, textures and
+    foliage, for the cost of a camera ray each; None is up to 16, of at least 8 rays each."""
     photons: int = 0
     """Paths from the lights for a photon map that gives the radiance at secondary hits in place of traced paths: free
     of noise but blurred, with caustics read at the primary hits; 0: none."""
@@ -90,6 +94,9 @@ class LightField:
     """With `cache`: error up to which a record serves, see `IrradianceCache`."""
     scene_rays: bool = True
     """With `cache`, and where a scene is at hand: let it stop the rays of records, and splats only light them."""
+    smoothing: float = 3.5
+    """With `cache`: radius [pixels] of the filter over what is gathered hit by hit, at 16 rays a pixel; it falls with
+    the square root of `rays`, as their noise does. A thin wall does not stop it. 0: none."""
     record_rays: int = 256
     """With `cache`: rays of a record."""
     light_samples: int = 32
@@ -103,7 +110,7 @@ class LightField:
     primary_rays: bool = False
     """Reconstruct what the lens sees while the shutter is open from camera rays, not what surfaces reflect from
     secondary rays (section 3.4); the whole picture, in the layer "image", and the way to render what moves. `rays` are
-    then those of a pixel; settings that say how indirect light is gathered mean nothing. 8 neighbours do well."""
+    then those of a pixel; settings that say how indirect light is gathered mean nothing."""
 
     def __post_init__(self) -> None:
         checks.count("spp", self.spp)
@@ -118,6 +125,7 @@ class LightField:
         checks.count("light_samples", self.light_samples)
         checks.number("tolerance", self.tolerance, 0.0, open_lower=True)
         checks.count("record_rays", self.record_rays)
+        checks.number("smoothing", self.smoothing, 0.0, 100.0)
         if self.cache and self.primary_rays:
             raise ValueError("cache and primary_rays are both set, expected one: a cache is for light on surfaces")
         if self.primary_hits is not None:
@@ -151,12 +159,13 @@ class LightField:
     @property
     def caching(self) -> Caching:
         """How records are placed."""
-        return IrradianceCache(rays=self.record_rays, tolerance=self.tolerance).caching
+        cache = IrradianceCache(rays=self.record_rays, tolerance=self.tolerance, smoothing=self.smoothing)
+        return cache.caching
 
     @property
     def hits(self) -> int:
         """Primary hits per pixel."""
-        return self.primary_hits or self.spp
+        return self.primary_hits or max(self.spp, min(SMOOTH_HITS, self.rays // FEWEST_RAYS))
 
     def passes(self, hits: int | None = None) -> tuple[int, str]:
         """Reconstruction rays for each primary hit, at `hits` of them in a pixel, and what to call them."""
@@ -195,7 +204,7 @@ class LightField:
             with_gloss=job.scene.scene.is_glossy and not self.photons and not self.cache,
         )
         caustics = light_by_photons(job, self.photons, samples, hits) if self.photons else None
-        state = self.reconstruction(samples, job.device, job.seed, hits, job.scene)
+        state = self.reconstruction(samples, job.device, job.seed, hits, job)
         if not isinstance(state, LensReconstruction):
             state.caustics = caustics
         return state
@@ -206,15 +215,16 @@ class LightField:
         device: Device,
         seed: int,
         hits: PrimaryHits | None = None,
-        scene: DeviceScene | None = None,
+        job: Job | None = None,
     ) -> AnyReconstruction:
         """Splats made of a sample buffer, ready for `gather`."""
         if self.primary_rays:
             return LensReconstruction(samples, device, self.preprocessing, seed)
         bandwidth = self.bandwidth and samples.bandwidth is not None and not self.cache
         make: Any = Reconstruction
-        if self.cache and self.scene_rays and scene is not None:
-            make = partial(TracedReconstruction, scene)
+        if self.cache and self.scene_rays and job is not None:
+            depths = (self.max_depth or NEVER) - 1, self.roulette_depth or NEVER
+            make = partial(TracedReconstruction, job, path_settings(job, *depths, self.sampler))
         elif samples.material is not None or bandwidth:
             make = partial(GlossyReconstruction, bandwidth=bandwidth)
         how = {"recursions": self.recursive, "recursive_rays": self.recursive_rays}
