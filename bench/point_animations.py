@@ -26,7 +26,7 @@ MOST_PLACES = 1 << 18
 def draw(
     out: Path, scene: str, size: tuple[int, int], frames: int, frame: int, reference_spp: int, device: str | None
 ) -> None:
-    """A frame's indirect light by 16 paths per pixel, by filtered points, and path-traced, side by side, with errors."""
+    """A frame's indirect light by 16 paths per pixel, by filtered points, and path-traced, side by side."""
     check_output(out)
     checks.image_size(size)
     checks.count("reference_spp", reference_spp, 2)

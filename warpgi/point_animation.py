@@ -209,13 +209,12 @@ class PointRun:
         return found
 
     def _projection(self, light: PointLight) -> Projection:
-        """One light's principal components, a coefficient in place of a pixel; a point has one truncation."""
+        """One light's principal components, a coefficient of a point in place of a pixel."""
         count = len(light.points)
         size = (count * light.width, 1)
 
         def smooth(images: np.ndarray) -> np.ndarray:
-            of_points = images.reshape(count, light.width, -1).mean(axis=1)
-            return np.repeat(light.lookup.smoothed(of_points), light.width, axis=0).reshape(images.shape)
+            return light.lookup.smoothed(images.reshape(count, -1)).reshape(images.shape)
 
         matrix = FrameMatrix(partial(self._load, light.name), len(self.numbers), size, self.device)
         signed = light.width > 1
