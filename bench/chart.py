@@ -14,7 +14,7 @@ from rich.progress import Progress
 import warpgi as gi
 from bench.chart_page import PAGE, RESULTS, RUNS, write_page
 from bench.chart_plot import PICTURE, draw
-from bench.chart_report import Point, equal_error, equal_time, lines, pareto_front, print_report
+from bench.chart_report import PathNoise, Point, equal_error, equal_time, lines, pareto_front, print_report
 from bench.contender import Contender, Place, Run, Settings, label
 from bench.contenders import contenders
 from bench.reference import CACHE, Reference, make_reference
@@ -231,6 +231,13 @@ class Chart:
             f" --device {self.device.name} --out a.exr"
         )
 
+    def path_noise(self) -> dict[str, PathNoise]:
+        """What each scene's reference says of path tracing."""
+        return {
+            name: PathNoise(int(reference.about["spp"]), float(reference.noise["relmse"] or 0.0))
+            for name, reference in self.references.items()
+        }
+
     def results(self) -> dict[str, Any]:
         """All that is known, as plain JSON."""
         points = self.points()
@@ -243,7 +250,7 @@ class Chart:
                 "lines": {who: [mine.index(point) for point in line.points] for who, line in lines(mine).items()},
                 "front": [mine.index(point) for point in pareto_front(mine)],
                 "equal_time": asdict(equal_time(mine)),
-                "equal_error": asdict(equal_error(mine)),
+                "equal_error": asdict(equal_error(mine, self.path_noise()[name])),
             }
         return {
             **circumstances(self.device, gi.versions()),
@@ -286,7 +293,7 @@ def report(chart: Chart, picture: Path) -> None:
     """Prints and writes what is finished."""
     for note in chart.notes:
         print(note)
-    print_report(chart.points())
+    print_report(chart.points(), noise=chart.path_noise())
     results = finite(chart.results())
     for reference in chart.references.values():
         chart.store.save_reference(reference)

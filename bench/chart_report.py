@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from rich.console import Console
@@ -130,10 +130,37 @@ def equal_time(points: Sequence[Point]) -> Comparison:
     return _compare(points, rows, lambda p: (p.seconds, p.relmse), descending=False)
 
 
-def equal_error(points: Sequence[Point]) -> Comparison:
+def equal_error(points: Sequence[Point], noise: PathNoise | None = None) -> Comparison:
     """Seconds of every contender to the same relMSE, the easy on the left, like short times."""
     rows = {name: line.seconds_at for name, line in lines(points).items()}
-    return _compare(points, rows, lambda p: (p.relmse, p.seconds), descending=True)
+    table = _compare(points, rows, lambda p: (p.relmse, p.seconds), descending=True)
+    if noise is None:
+        return table
+    by_noise = noise.seconds_at(points)
+    return replace(table, rows=table.rows | {PATH_BY_NOISE: tuple(by_noise(error) for error in table.columns)})
+
+
+@dataclass(frozen=True)
+class PathNoise:
+    """What a path-traced reference says of path tracing itself."""
+
+    spp: int
+    relmse: float
+    """Of its own noise."""
+
+    def seconds_at(self, points: Sequence[Point]) -> Callable[[float], float | None]:
+        """Seconds of path tracing to an error above that: relMSE falls as 1 / spp, and a sample takes as long as in the
+        longest of its runs among the points."""
+        runs = [point for point in points if point.contender == "path"]
+        if not runs or self.relmse <= 0.0:
+            return lambda relmse: None
+        longest = max(runs, key=lambda point: int(point.settings["spp"]))
+        seconds = longest.seconds / int(longest.settings["spp"]) * self.spp
+        return lambda relmse: seconds * self.relmse / relmse if relmse >= self.relmse else None
+
+
+#: Row of the table at equal errors: path tracing where its own settings on the chart do not reach.
+PATH_BY_NOISE = "path, by the reference's noise"
 
 
 def _compare(
@@ -164,8 +191,10 @@ def _compare(
     return Comparison(tuple(used), rows, tuple(best))
 
 
-def print_report(points: Sequence[Point], console: Console | None = None) -> None:
-    """Writes the tables of every scene."""
+def print_report(
+    points: Sequence[Point], console: Console | None = None, noise: Mapping[str, PathNoise] | None = None
+) -> None:
+    """Writes the tables of every scene; `noise` is that of the scenes' references."""
     console = console or Console()
     console = console if console.is_terminal or console.record else Console(width=200, file=console.file)
     for scene in dict.fromkeys(point.scene for point in points):
@@ -173,7 +202,7 @@ def print_report(points: Sequence[Point], console: Console | None = None) -> Non
         console.print(f"{scene}: relMSE at equal time", style="bold", highlight=False)
         console.print(_table(equal_time(mine), "{:g} s"))
         console.print(f"{scene}: seconds at equal relMSE", style="bold", highlight=False)
-        console.print(_table(equal_error(mine), "{:g}"))
+        console.print(_table(equal_error(mine, (noise or {}).get(scene)), "{:g}"))
         front = ", ".join(f"{p.contender} ({p.label})" for p in pareto_front(mine))
         console.print(f"{scene}, Pareto front, fast to good: {front}", highlight=False, soft_wrap=True)
         floored = [f"{p.contender} ({p.label})" for p in mine if p.at_floor]

@@ -35,7 +35,7 @@ LADDERS: dict[str, tuple[Settings, ...]] = {
             (1, 20_000, 0),
             (4, 50_000, 4),
             (8, 100_000, 8),
-            (16, 200_000, 8),
+            (16, 200_000, 16),
         )
     ),
     "instant-radiosity": tuple({"paths": paths} for paths in (10, 32, 64, 256, 1024)),
@@ -52,18 +52,27 @@ LADDERS: dict[str, tuple[Settings, ...]] = {
     ),
 }
 
-#: The same with an irradiance cache: samples, primary hits and rays per pixel, and rays of a record.
+#: The same with an irradiance cache: samples, primary hits and rays per pixel, rays of a record, and recursions, which
+#: tell on smooth surfaces alone.
 CACHED_LIGHT_FIELD: tuple[Settings, ...] = tuple(
     {"spp": spp, "primary_hits": hits, "light_samples": hits, "rays": rays, "record_rays": record, "cache": True}
-    | {"recursive": 1, "recursive_rays": 4, "tolerance": 0.3}
-    for spp, hits, rays, record in (
-        (1, 2, 16, 64),
-        (1, 4, 32, 128),
-        (1, 8, 64, 256),
-        (1, 8, 64, 1024),
-        (2, 8, 128, 1024),
-        (4, 16, 256, 2048),
+    | {"recursive": recursions, "recursive_rays": 4, "tolerance": 0.3}
+    for spp, hits, rays, record, recursions in (
+        (1, 2, 2, 64, 0),
+        (1, 4, 4, 64, 0),
+        (1, 4, 4, 128, 1),
+        (1, 8, 8, 128, 0),
+        (1, 8, 16, 256, 1),
+        (1, 16, 16, 256, 0),
+        (1, 8, 64, 1024, 1),
+        (2, 16, 64, 1024, 1),
+        (4, 16, 256, 2048, 1),
     )
+)
+
+#: Photon maps that get finer, one for every four camera paths, most of whose photons make caustics.
+PROGRESSIVE: tuple[Settings, ...] = tuple(
+    {"spp": spp, "map_spp": 4, "photons": 50_000, "caustic_photons": 200_000, "final_gather": 4} for spp in (4, 16, 64)
 )
 
 #: Few reconstruction rays whose light is filtered: samples, primary hits and rays per pixel.
@@ -87,6 +96,7 @@ PEERS: dict[str, Callable[[], Contender]] = {
     "mitsuba llvm_ad_rgb": lambda: mitsuba("llvm_ad_rgb"),
     "oidn": oidn,
     "light-field cache": lambda: own("light-field", CACHED_LIGHT_FIELD, "light-field cache"),
+    "photon-map progressive": lambda: own("photon-map", PROGRESSIVE, "photon-map progressive"),
     "irradiance-filter sparse": lambda: own("irradiance-filter", SPARSE_FILTER, "irradiance-filter sparse"),
 }
 

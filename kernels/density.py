@@ -215,9 +215,34 @@ def near_photons(
 ) -> vec8: ...
 
 
+# Place of the nearest lane if its own radius covers the point, no farther than the root of `limit2`; else -1.
+NEAREST_IF_COVERING = (
+    LANES_HEAD
+    + AT_POINT
+    + "    float worst = limit2;\n    int found = -1;\n"
+    + search(
+        """
+                    worst = m2[j];
+                    found = block * 8 + j;
+""",
+        FACING,
+    ).replace("(d2[j] > 0.0f) & ", "")
+    + """
+    const float* q = tree.blocks.data + (size_t)(found / 8) * 80 + found % 8 + 48;
+    return found >= 0 && worst <= *q ? found : -1;
+"""
+)
+
+
+@wp.func_native(NEAREST_IF_COVERING)
+def nearest_if_covering(
+    tree: SplatTree, x: wp.vec3, n: wp.vec3, limit2: float, stretch: float, facing: float
+) -> int: ...
+
+
 # Place of the nearest lane whose own radius covers the point; -1: none. Boxes hold the lanes' balls, so that the point
 # is in the boxes of all that cover it.
-NEAREST_PLACE = (
+NEAREST_COVERING = (
     LANES_HEAD
     + AT_POINT
     + "    float worst = 1.0e30f;\n    int found = -1;\n"
@@ -234,8 +259,23 @@ NEAREST_PLACE = (
 )
 
 
-@wp.func_native(NEAREST_PLACE)
-def nearest_place(tree: SplatTree, x: wp.vec3, n: wp.vec3, stretch: float, facing: float) -> int: ...
+@wp.func_native(NEAREST_COVERING)
+def nearest_covering(tree: SplatTree, x: wp.vec3, n: wp.vec3, stretch: float, facing: float) -> int: ...
+
+
+@wp.func
+def nearest_place(
+    places: SplatTree, balls: SplatTree, usual2: float, x: wp.vec3, n: wp.vec3, stretch: float, facing: float
+):
+    """Place of the nearest lane whose own radius covers the point; -1: none.
+
+    That is nearly always the nearest lane, which is found faster than all that cover the point. `places` and `balls`
+    are the same lanes in boxes of their centres and of their balls; beyond the root of `usual2` the second are asked.
+    """
+    place = nearest_if_covering(places, x, n, usual2, stretch, facing)
+    if place < 0:
+        place = nearest_covering(balls, x, n, stretch, facing)
+    return place
 
 
 # The k-th photon of a search nearby is rarely farther, by the squares.

@@ -6,9 +6,9 @@ Lamorlette 2004), so that no seam shows where a record begins to count.
 
 import warp as wp
 
-from warpgi.kernels.lanes import POINT_WALK
+from warpgi.kernels.lanes import LANES_HEAD, POINT_WALK
 from warpgi.kernels.sampling import INV_PI
-from warpgi.kernels.splats import SplatTree
+from warpgi.kernels.splats import SplatTree, search
 
 wp.set_module_options({"enable_backward": False})
 
@@ -187,17 +187,36 @@ def find_uncovered(
     wanted[i] = h
 
 
+# Radius of a record by its neighbours', R_i <= R_j + |x_i - x_j| (Krivanek et al. 2006). Those beyond its own radius,
+# and then beyond what is left of it, cannot make it smaller. Boxes are those of points.
+CLAMPED = (
+    LANES_HEAD
+    + """
+    const int block0 = i / 8;
+    const float* q = tree.blocks.data + (size_t)block0 * 80 + i % 8;
+    const float cx = q[0], cy = q[8], cz = q[16], nx = 0.0f, ny = 0.0f, nz = 0.0f, stretch = 0.0f;
+    float radius = radii.data[i];
+    float worst = radius * radius;
+"""
+    + search(
+        """
+                    radius = smaller(radius, radii.data[block * 8 + j] + wp::sqrt(d2[j]));
+                    worst = radius * radius;
+"""
+    )
+    + "    return radius;\n"
+)
+
+
+@wp.func_native(CLAMPED)
+def clamped_radius(tree: SplatTree, radii: wp.array[float], i: int) -> float: ...
+
+
 @wp.kernel
-def clamp_radii(offset: int, positions: wp.array[wp.vec3], radii: wp.array[float], count: int, result: wp.array[float]):
-    """One thread owns one record: its radius by its neighbours', R_i <= R_j + |x_i - x_j| (Krivanek et al. 2006)."""
+def clamp_radii(offset: int, tree: SplatTree, radii: wp.array[float], result: wp.array[float]):
+    """One thread owns one record in the tree's order and clamps its radius by its neighbours'."""
     i = offset + wp.tid()
-    radius = radii[i]
-    for j in range(count):
-        # most are too far to matter
-        d2 = wp.length_sq(positions[i] - positions[j])
-        if d2 < radius * radius:
-            radius = wp.min(radius, radii[j] + wp.sqrt(d2))
-    result[i] = radius
+    result[i] = clamped_radius(tree, radii, i)
 
 
 @wp.kernel

@@ -45,8 +45,10 @@ class Maps:
     """What is known of light that came over at least one surface."""
 
     caustic: SplatTree  # photons L S+ D
-    diffuse: SplatTree  # without gathering photons of all other indirect light
-    irradiance: SplatTree  # for gathering: irradiance of all light at some points, which cover their radius
+    diffuse: SplatTree  # photons of all other indirect light; for gathering of what caustics elsewhere send here
+    irradiance: SplatTree  # for gathering: that of all light but caustics at some points, which cover their radius
+    places: SplatTree  # the same in boxes of the points alone
+    usual2: float  # squared radius of such a point, in the middle
     caustic_look: Lookup
     diffuse_look: Lookup
     reach2: float  # that such a point's squared radius is raised by, where few photons make a radius
@@ -107,7 +109,7 @@ def irradiance_near(maps: Maps, x: wp.vec3, n: wp.vec3):
     """That of the nearest point at which it is known, and whose estimate reaches here (Christensen 1999)."""
     result = Density()
     look = maps.diffuse_look
-    place = nearest_place(maps.irradiance, x, n, look.stretch, look.facing)
+    place = nearest_place(maps.places, maps.irradiance, maps.usual2, x, n, look.stretch, look.facing)
     if place >= 0:
         k = (place // LANES) * BLOCK_STRIDE + place % LANES
         b = maps.irradiance.blocks
@@ -120,7 +122,7 @@ def irradiance_near(maps: Maps, x: wp.vec3, n: wp.vec3):
 class Incident:
     """Light that came along a gather ray."""
 
-    radiance: wp.vec3  # that a diffuse surface reflected last; caustics are not in it
+    radiance: wp.vec3  # that a diffuse surface reflected last, but of caustics on it, which few rays would find
     direct: wp.vec3  # of lights that the ray met first, weighted against light sampling
     distance: float  # to the first hit, FAR: none
     closest_hit_rays: int
@@ -134,8 +136,8 @@ def incident_light(
     """Light from o along d that is direct or was last reflected by a diffuse surface, over any others in between.
 
     Where the map's radius reaches back to the ray's origin the map would mix up the two surfaces of a corner: the ray
-    goes on from there, with light and caustics of that point added. `first_pdf` is the density of d where light
-    sampling at o shares what it meets, else 0.
+    goes on from there, with direct light of that point added, and what caustics elsewhere send there. `first_pdf` is
+    the density of d where light sampling at o shares what it meets, else 0.
     """
     o = o_
     d = d_
@@ -192,9 +194,9 @@ def incident_light(
                 sampled = direct_light(scene, shape, s, n, wo, sample_2d(sampler, pair), choice, 1.0)
                 result.shadow_rays = result.shadow_rays + sampled.shadow_rays
                 result.radiance = result.radiance + wp.cw_mul(throughput, sampled.radiance)
-            caustic = density(maps.caustic, scene, maps.caustic_look, s.p, side, 0.0, key, index)
-            result.closest_hit_rays = result.closest_hit_rays + caustic.rays
-            reflected = wp.cw_mul(throughput, wp.cw_mul(s.albedo, caustic.irradiance)) * INV_PI
+            echo = density(maps.diffuse, scene, maps.diffuse_look, s.p, side, 0.0, key, index)
+            result.closest_hit_rays = result.closest_hit_rays + echo.rays
+            reflected = wp.cw_mul(throughput, wp.cw_mul(s.albedo, echo.irradiance)) * INV_PI
             result.radiance = result.radiance + reflected
         b = sample(shape, s.albedo, n, wo, sample_2d(sampler, pair + 2))
         if wp.max(b.weight) <= 0.0 or (b.transmitted == 0 and not reflects(s, wo, b.wi)):
@@ -231,8 +233,8 @@ def gather_irradiance(
     irradiance: wp.array[wp.vec3],
     inverse_distance: wp.array[float],
 ):
-    """One thread owns one point, a little off its surface: irradiance of indirect light but caustics, by gathering,
-    and the mean of 1 / distance over its rays.
+    """One thread owns one point, a little off its surface: irradiance of indirect light by gathering, without that
+    of caustics here and elsewhere, and the mean of 1 / distance over its rays.
     """
     i = offset + wp.tid()
     total = wp.vec3(0.0)
@@ -286,11 +288,12 @@ def caustics_at(
     albedo: wp.array[wp.vec3],
     reflected: wp.array[wp.vec3],
 ):
-    """One thread owns one primary hit: the caustic light that it reflects."""
+    """One thread owns one primary hit: the light that it reflects of caustics here and, for gathering, elsewhere."""
     i = offset + wp.tid()
     if max_abs(origins[i]) < MET:
-        found = density(maps.caustic, scene, maps.caustic_look, origins[i], normals[i], 0.0, i, 0)
-        reflected[i] = wp.cw_mul(albedo[i], found.irradiance) * INV_PI
+        here = density(maps.caustic, scene, maps.caustic_look, origins[i], normals[i], 0.0, i, 0)
+        elsewhere = density(maps.diffuse, scene, maps.diffuse_look, origins[i], normals[i], 0.0, i, 0)
+        reflected[i] = wp.cw_mul(albedo[i], here.irradiance + elsewhere.irradiance) * INV_PI
 
 
 @wp.func
@@ -367,10 +370,9 @@ def follow(scene: Scene, maps: Maps, view: View, pixel: int, index: int, sampler
             found = density(maps.caustic, scene, maps.caustic_look, s.p, side, 0.0, pixel, index)
             path.closest_hit_rays = path.closest_hit_rays + found.rays
             irradiance = found.irradiance
-            if view.gather == 0:
-                found = density(maps.diffuse, scene, maps.diffuse_look, s.p, side, 0.0, pixel, index)
-                path.closest_hit_rays = path.closest_hit_rays + found.rays
-                irradiance = irradiance + found.irradiance
+            found = density(maps.diffuse, scene, maps.diffuse_look, s.p, side, 0.0, pixel, index)
+            path.closest_hit_rays = path.closest_hit_rays + found.rays
+            irradiance = irradiance + found.irradiance
             reflectance = wp.cw_mul(throughput, base_reflectance(shape, s.albedo, n, wo))
             for ray in range(rays):
                 number = index * rays + ray

@@ -33,6 +33,7 @@ wp.set_module_options({"enable_backward": False})
 DIRECT = wp.constant(0)  # L D
 CAUSTIC = wp.constant(1)  # L S+ D
 INDIRECT = wp.constant(2)  # any other
+ECHO = wp.constant(3)  # L S+ D S* D: indirect too, and last reflected by a diffuse surface from a caustic on it
 
 # Pairs of random numbers: cell and light, point on it, aim, side of it; then two for each scattering.
 EMISSION_PAIRS = wp.constant(4)
@@ -80,7 +81,7 @@ class Photons:
     position: wp.array[wp.vec3]
     normal: wp.array[wp.vec3]  # of the real surface, on the side that the light came from
     flux: wp.array[wp.vec3]  # [W]
-    kind: wp.array[int]  # DIRECT, CAUSTIC or INDIRECT
+    kind: wp.array[int]  # DIRECT, CAUSTIC, INDIRECT or ECHO
     # for those who read them as lights; empty for others
     face: wp.array[int]
     bary: wp.array[wp.vec2]  # of the triangle's first and second corner
@@ -235,6 +236,12 @@ def store(photons: Photons, k: int, p: wp.vec3, ng: wp.vec3, flux: wp.vec3, kind
         photons.incident[k] = wo
 
 
+@wp.func
+def reflected_kind(kind: int):
+    """What a photon is once a diffuse surface reflected it."""
+    return wp.where(kind == CAUSTIC, ECHO, INDIRECT)
+
+
 @wp.struct
 class Track:
     """What became of one path."""
@@ -301,7 +308,7 @@ def trace_photons(scene: Scene, emission: Emission, path: int, photons: Photons,
         if shape.kind == DIFFUSE:
             if emission.caustics != 0:
                 break
-            kind = int(INDIRECT)
+            kind = reflected_kind(kind)
             # away along the real surface; who looks from there sees the shading normal unless it is turned away
             d = to_world(make_frame(ng), square_to_cosine_hemisphere(sample_2d(sampler, pair)))
             seen = wp.where(wp.dot(ns, d) > 0.0, ns, ng)
@@ -334,7 +341,7 @@ def trace_photons(scene: Scene, emission: Emission, path: int, photons: Photons,
                 else:
                     left = wp.cw_mul(left, wp.vec3(1.0) - share) / (1.0 - part)
             if by_base == 1:
-                kind = int(INDIRECT)
+                kind = reflected_kind(kind)
             elif kind == DIRECT:
                 kind = int(CAUSTIC)
 

@@ -5,18 +5,26 @@ import warp as wp
 from warpgi.kernels.hemisphere import Hemispheres, stratum_direction
 from warpgi.kernels.lanes import POINT_WALK
 from warpgi.kernels.light_field import GATHER_PAIR, Gathered, Incident, Receivers
+from warpgi.kernels.path import PathSettings
+from warpgi.kernels.path_strata import incident_light
 from warpgi.kernels.rng import SOBOL, make_sampler, sample_2d
 from warpgi.kernels.sampling import make_frame, square_to_cosine_hemisphere, to_world
 from warpgi.kernels.scene import FAR, Scene, closest_hit, offset_origin
-from warpgi.kernels.splats import SplatTree, nearest_facing, splat_radiance
+from warpgi.kernels.splats import SplatTree
 
 wp.set_module_options({"enable_backward": False})
 
-# Radiance times weight of the splats that cover x, on a surface with normal n, and the weight: a tent, as for
-# reconstruction rays. Splats turned by more than 45 degrees, or whose plane is far, are of another surface. The tree's
-# boxes are those of balls.
+vec5 = wp.types.vector(length=5, dtype=wp.float32)
+
+# A ray shorter than this part of the radius of the splats at its end ends in detail that they do not resolve, such as a
+# crevice or the next leaf.
+NEAR = wp.constant(0.5)
+
+# Radiance times weight of the splats that cover x, on a surface with normal n, the weight, and their squared radius
+# times it: a tent, as for reconstruction rays. Splats turned by more than 45 degrees, or whose plane is far, are of
+# another surface. The tree's boxes are those of balls.
 COVERING = (
-    "    float r = 0.0f, g = 0.0f, b = 0.0f, weight = 0.0f;\n"
+    "    float r = 0.0f, g = 0.0f, b = 0.0f, weight = 0.0f, square = 0.0f;\n"
     + POINT_WALK
     + """
             float w[8];
@@ -35,23 +43,39 @@ COVERING = (
                 g += w[k] * p[64 + k];
                 b += w[k] * p[72 + k];
                 weight += w[k];
+                square += w[k] * p[48 + k];
             }
         }
     }
-    return wp::vec_t<4, wp::float32>(r, g, b, weight);
+    wp::vec_t<5, wp::float32> result;
+    result[0] = r; result[1] = g; result[2] = b; result[3] = weight; result[4] = square;
+    return result;
 """
 )
 
 
 @wp.func_native(COVERING)
-def covering_splats(tree: SplatTree, x: wp.vec3, n: wp.vec3, noise: float) -> wp.vec4: ...
+def covering_splats(tree: SplatTree, x: wp.vec3, n: wp.vec3, noise: float) -> vec5: ...
+
+
+@wp.struct
+class Light:
+    """What light rays find where the scene stops them."""
+
+    tree: SplatTree
+    paths: PathSettings  # of paths from where splats do not tell
+    step: float  # from a surface to where its rays start
+    noise: float
 
 
 @wp.func
-def traced(scene: Scene, tree: SplatTree, p: wp.vec3, n: wp.vec3, d: wp.vec3, step: float, noise: float):
-    """What a ray from a surface finds: light of splats where the scene stops it."""
+def traced(scene: Scene, light: Light, p: wp.vec3, n: wp.vec3, d: wp.vec3, key: int, number: int):
+    """What a ray from a surface finds: light of splats where the scene stops it, or of a path where they do not tell.
+
+    `key` and `number` are of the path's random numbers.
+    """
     result = Incident()
-    o = offset_origin(p, n, step, d)
+    o = offset_origin(p, n, light.step, d)
     hit = closest_hit(scene, o, d)
     if hit.face < 0:
         # what the environment sends is direct light
@@ -61,14 +85,13 @@ def traced(scene: Scene, tree: SplatTree, p: wp.vec3, n: wp.vec3, d: wp.vec3, st
     x = o + d * hit.t
     ng = scene.face_normals[hit.face]
     result.distance = hit.t
-    found = covering_splats(tree, x, wp.where(wp.dot(ng, d) < 0.0, ng, -ng), noise)
-    if found[3] > 0.0:
+    found = covering_splats(light.tree, x, wp.where(wp.dot(ng, d) < 0.0, ng, -ng), light.noise)
+    if hit.t * hit.t * found[3] > NEAR * NEAR * found[4]:
         result.radiance = wp.vec3(found[0], found[1], found[2]) / found[3]
         return result
     result.counts[3] = 1
-    nearest = nearest_facing(tree, x, d)
-    if nearest >= 0:
-        result.radiance = splat_radiance(tree, nearest)
+    path = incident_light(scene, light.paths, p, n, d, light.step, key, number)
+    result.radiance = wp.vec3(path[0], path[1], path[2])
     return result
 
 
@@ -76,11 +99,9 @@ def traced(scene: Scene, tree: SplatTree, p: wp.vec3, n: wp.vec3, d: wp.vec3, st
 def trace_splat_strata(
     offset: int,
     scene: Scene,
-    tree: SplatTree,
+    light: Light,
     hemispheres: Hemispheres,
     seed: int,
-    step: float,
-    noise: float,
     strata: wp.array[wp.vec4],
     counts: wp.array[wp.vec4i],
 ):
@@ -92,7 +113,7 @@ def trace_splat_strata(
     total = wp.vec4i(0)
     for k in range(size):
         d = to_world(frame, stratum_direction(hemispheres, i, k, seed))
-        found = traced(scene, tree, hemispheres.points[i], n, d, step, noise)
+        found = traced(scene, light, hemispheres.points[i], n, d, hemispheres.keys[i], k)
         strata[i * size + k] = wp.vec4(found.radiance[0], found.radiance[1], found.radiance[2], found.distance)
         total = total + found.counts
     counts[i] = total
@@ -102,14 +123,12 @@ def trace_splat_strata(
 def gather_traced(
     offset: int,
     scene: Scene,
-    tree: SplatTree,
+    light: Light,
     receivers: Receivers,
     rays_each: int,
     first_ray: int,
     ray_count: int,
     seed: int,
-    step: float,
-    noise: float,
     gathered: Gathered,
 ):
     """One thread owns a receiver and sends `ray_count` of its `rays_each` cosine-distributed rays."""
@@ -117,13 +136,15 @@ def gather_traced(
     j = receivers.sample[i]
     n = receivers.normals[j]
     frame = make_frame(n)
+    pixel = j // receivers.spp
     total = gathered.radiance[i]
     counts = gathered.counts[i]
     for ray in range(first_ray, first_ray + ray_count):
         # one sequence a pixel, cut into the shares of its samples
-        sampler = make_sampler(seed, j // receivers.spp, (j % receivers.spp) * rays_each + ray, SOBOL)
+        number = (j % receivers.spp) * rays_each + ray
+        sampler = make_sampler(seed, pixel, number, SOBOL)
         d = to_world(frame, square_to_cosine_hemisphere(sample_2d(sampler, GATHER_PAIR)))
-        found = traced(scene, tree, receivers.origins[j], n, d, step, noise)
+        found = traced(scene, light, receivers.origins[j], n, d, pixel, number)
         total = total + found.radiance
         counts = counts + found.counts
     gathered.radiance[i] = total

@@ -215,6 +215,21 @@ def test_tables_compare_at_equal_time_and_equal_error(bench):
     assert bench.chart_report.equal_time([]).columns == ()
 
 
+def test_the_reference_is_a_path_tracer_too(bench):
+    """Where path tracing's own runs are too noisy, the table has its time by the noise of the reference: of 64 samples
+    and relMSE 0.25, at 2 s for 16; nothing is said of errors below that, or without a run that tells its speed."""
+    path = [replace(point(bench, "path", 2.0, 1.0), settings={"spp": 16}), point(bench, "path", 0.2, 15.0)]
+    points = path + power_law(bench, "photons", 1.0, seconds=(0.3, 10.0))
+    noise = bench.chart_report.PathNoise(64, 0.25)
+    row = bench.chart_report.PATH_BY_NOISE
+    table = bench.chart_report.equal_error(points, noise)
+    assert table.columns == (10.0, 3.0, 1.0, 0.3, 0.1)
+    # spp 16 has relMSE 1 by that noise as well
+    assert table.rows[row] == pytest.approx((0.2, 2.0 / 3.0, 2.0, 2.0 / 0.3, None))
+    assert table.best == bench.chart_report.equal_error(points).best
+    assert set(bench.chart_report.equal_error(points[2:], noise).rows[row]) == {None}
+
+
 def test_nobody_is_best_by_the_absence_of_others(bench):
     """Where the only entry is beaten by somebody whose line ended before, at less time and error, there is no best."""
     fast = power_law(bench, "fast", 0.01, seconds=(0.1, 1.0))

@@ -9,10 +9,16 @@ import pytest
 import warp as wp
 
 import warpgi as gi
-from warpgi.irradiance import Irradiance
+from warpgi.device_scene import DeviceScene
+from warpgi.film import Film
+from warpgi.irradiance import Irradiance, PathSource
+from warpgi.job import Job
+from warpgi.methods.path import NEVER, Sampler
 from warpgi.reconstruction import PrimaryHits
 from warpgi.record_cache import COARSEST, RecordCache, grids
 from warpgi.records import Records
+from warpgi.sampling import path_settings, trace_sample_buffer
+from warpgi.traced_reconstruction import TracedReconstruction
 
 SIDE = 64
 WHITE = np.ones((SIDE * SIDE, 3), np.float32)
@@ -209,6 +215,114 @@ def test_interrupted_cache_is_a_picture():
     assert np.isfinite(cache.reflected(64).numpy()).all()
 
 
+def random_normals(count, seed, spread=1.0):
+    """Unit vectors around +z."""
+    normals = np.random.default_rng(seed).normal(size=(count, 3)) * spread + (0.0, 0.0, 1.0)
+    return (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
+
+
+class NoisyLight:
+    """A source with nothing for records, whose light at hits is given."""
+
+    def __init__(self, light):
+        self.light, self.counts = light, {}
+
+    def at_hits(self, hits, rays):
+        return wp.array(np.repeat(self.light[hits][:, None], 3, axis=1).astype(np.float32), dtype=wp.vec3, device="cpu")
+
+
+def unserved(hits, light, smoothing, rays=16, device=None):
+    """Irradiance where no record serves, by that light and the filter."""
+    caching = gi.IrradianceCache(smoothing=smoothing).caching
+    cache = RecordCache(device or gi.Device("cpu"), hits, (SIDE, SIDE), NoisyLight(light), caching)
+    cache.rounds_done = len(cache.rounds)
+    return cache.reflected(rays).numpy()[:, 0] * np.pi
+
+
+def test_radii_by_neighbours():
+    """No record reaches farther than R_j + |x_i - x_j| of any other, and as far as that: all pairs are the judge."""
+    rng = np.random.default_rng(0)
+    count = 500
+    normals = random_normals(count, 1, spread=9.0)
+    zeros = np.zeros((count, 3, 3), np.float32)
+    points = rng.random((count, 3)).astype(np.float32)
+    radii = rng.lognormal(-2.0, 1.5, count).astype(np.float32)
+    known = Records(points, normals, radii, points, zeros, zeros)
+    caching = gi.IrradianceCache().caching
+    cache = RecordCache(gi.Device("cpu"), floor_hits(), (SIDE, SIDE), NoisyLight(radii), caching, known)
+    distance = np.linalg.norm(points[:, None].astype(np.float64) - points, axis=2)
+    expected = (radii + distance).min(axis=1)
+    assert (expected < radii).sum() > 100
+    order = cache._tree.order.numpy()
+    found = cache._kernel_records.values.numpy().reshape(-1, 24)[:, 0]
+    np.testing.assert_allclose(found, expected[order], rtol=1e-5)
+
+
+def test_filter_keeps_what_is_even_and_far():
+    """Equal light stays equal, and light of one surface does not reach another that is far behind it."""
+    hits = floor_hits()
+    points = hits.origin.copy()
+    right = points[:, 0] > 0.5
+    points[right, 2] = -1.0
+    hits = dataclasses.replace(hits, origin=points, normal=random_normals(len(points), 0))
+    light = np.where(right, 0.25, 3.0)
+    np.testing.assert_allclose(unserved(hits, light, 4.0), light, rtol=1e-5)
+
+
+def test_filter_follows_normals():
+    """Where leaves turn at random noise falls to less than a third, and light follows each hit's own normal."""
+    one = floor_hits()
+    hits = PrimaryHits(np.repeat(one.origin, 4, axis=0), random_normals(4 * SIDE**2, 1), np.repeat(WHITE, 4, axis=0), 4)
+    truth = 2.0 + hits.normal.astype(np.float64) @ (0.5, -0.4, 1.0)
+    noise = np.random.default_rng(2).normal(size=truth.shape) * 0.5
+    errors = unserved(hits, truth + noise, 4.0) - truth
+    still = unserved(hits, truth, 4.0) - truth
+    assert np.std(errors - still) < 0.5 / 3
+    assert abs(errors.mean()) < 4.4 * 0.5 / (2 * SIDE)
+    # what the ridge of 0.1 holds back of the slope, where normals of pixels have a variance of 0.07 along each axis
+    assert np.std(still) < 0.7 * truth.std()
+    assert np.corrcoef(still, truth)[0, 1] < 0.0
+
+
+def test_filter_narrows_with_rays():
+    """More rays make it narrower until it does nothing: the picture goes to that of the rays alone."""
+    hits = floor_hits()
+    light = np.random.default_rng(3).random(SIDE * SIDE)
+    np.testing.assert_array_equal(unserved(hits, light, 0.0), unserved(hits, light, 0.0, rays=1024))
+    changes = [np.abs(unserved(hits, light, 4.0, rays) - light).mean() for rays in (1, 64, 4096)]
+    assert changes[0] > changes[1] > changes[2]
+    one, many = (unserved(hits, light, 4.0, device=gi.Device("cpu", threads=n)) for n in (1, 3))
+    np.testing.assert_array_equal(one, many)
+
+
+def test_paths_where_splats_do_not_tell():
+    """Where all splats are larger than the room every ray is a path, and irradiance that of path tracing."""
+    scene = gi.scenes.cornell_box()
+    device = gi.Device("cpu")
+    on_device = DeviceScene(scene, device)
+    size = (16, 16)
+    job = Job(on_device, on_device.camera(size), size, 0, device)
+    paths = path_settings(job, NEVER, 5, Sampler.SOBOL)
+    samples, hits = trace_sample_buffer(
+        job, Film(size, device, 1 << 30), 1, 1, 1, NEVER, 5, Sampler.SOBOL, with_hit_light=False
+    )
+    state = TracedReconstruction(job, paths, samples, device, gi.LightField().preprocessing, 0, hits)
+    some = state.primary
+    few = state.irradiance_at(some, 16)
+    assert 0 < state.all_counts()["path_rays"] < 0.5 * 16 * len(some)
+    state.tree.set_radius2(device.array(np.full(state.tree.count, 1e4, np.float32), float))
+    state.tree.refit_as_balls()
+    before = state.all_counts()
+    ours = state.irradiance_at(some, 64).numpy().astype(np.float64).mean(axis=1)
+    after = state.all_counts()
+    assert sum(after[name] - before[name] for name in ("path_rays", "sky_rays")) == 64 * len(some)
+    theirs = PathSource(job, hits, paths).at_hits(some, 64).numpy().astype(np.float64).mean(axis=1)
+    # pixels are independent, and so are the directions of the two
+    difference = ours - theirs
+    assert abs(difference.mean()) < 4.4 * difference.std() / np.sqrt(len(some))
+    assert abs(few.numpy().mean() / theirs.mean() - 1.0) < 0.1
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -217,6 +331,7 @@ def test_interrupted_cache_is_a_picture():
         ({"finest": 3}, "finest is 3, expected a power of 2"),
         ({"min_radius": 9.0, "max_radius": 8.0}, "max_radius is 8"),
         ({"rays": 0}, "rays is 0"),
+        ({"smoothing": -1.0}, "smoothing is -1"),
         ({"roulette_depth": None}, "max_depth and roulette_depth"),
     ],
 )

@@ -177,6 +177,24 @@ def test_pictures_agree_with_path_tracing():
             assert b.mean() == pytest.approx(a.mean(), rel=0.02)
 
 
+def test_gather_rays_make_no_dots_of_caustics():
+    """Light of caustics elsewhere is neither lost nor counted twice, and no pixel of the ceiling, which looks down on a
+    caustic, is far from its neighbours."""
+    scene = gi.scenes.cornell_spheres()
+    settings = {"photons": 100_000, "caustic_photons": 50_000, "spp": 4}
+    seen, gathered = (
+        gi.render(scene, gi.PhotonMap(final_gather=rays, **settings), (64, 64), device="cpu").layers["indirect"]
+        for rays in (0, 8)
+    )
+    # of the light that the spheres do not show, whose reflections are noise of the camera paths; that of caustics
+    # elsewhere is a tenth of it
+    walls = np.s_[2:30, 4:60]
+    assert gathered[walls].mean() == pytest.approx(seen[walls].mean(), rel=0.02)
+    ceiling = gathered[2:6, 10:54].sum(axis=2)
+    # it is itself half as bright again in the middle; a ray in 32 that met the caustic would make it twice that
+    assert ceiling.max() < 1.8 * ceiling.mean()
+
+
 def test_gather_rays_may_go_on():
     """Where gather rays end changes no mean: light and caustics of the surfaces that they pass take the map's place."""
     corners = [(x, 0.95, z) for x, z in ((-0.9, -0.9), (0.9, -0.9), (0.9, 0.9), (-0.9, 0.9))]

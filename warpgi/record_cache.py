@@ -17,6 +17,7 @@ from warpgi.device import Device
 from warpgi.irradiance import IrradianceSource
 from warpgi.kernels import bvh
 from warpgi.kernels import irradiance_cache as kernels
+from warpgi.kernels import regression_filter as filtering
 from warpgi.kernels.hemisphere import sum_strata
 from warpgi.reconstruction import NOISE_ULPS, PrimaryHits
 from warpgi.records import Records
@@ -29,11 +30,13 @@ COARSEST = 32
 SUPPORT = 3
 # Device bytes of a primary hit: irradiance, what it reflects, a mark.
 BYTES_PER_HIT = 2 * 12 + 4
+# Rays of a pixel at which the filter over what they brought is as wide as the setting says.
+SMOOTHED_RAYS = 16
 # A record in front of which a point lies by more than this part of its radius is not used for it.
 FRONT = 0.01
 
 #: What a cache launches, to be compiled first: a kernel of each module.
-KERNELS = (kernels.interpolate, sum_strata, bvh.fill_blocks)
+KERNELS = (kernels.interpolate, sum_strata, filtering.regress, bvh.fill_blocks)
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,8 @@ class Caching:
     """Pixels between those of the finest grid; what it leaves without a record is gathered hit by hit."""
     gradients: bool
     """Extrapolate records by their gradients."""
+    smoothing: float
+    """Radius in pixels of the filter over hits that no record serves, at 16 rays a pixel; 0: none."""
 
     @property
     def rings(self) -> int:
@@ -157,6 +162,7 @@ class RecordCache:
             rays = fallback_rays if self.rounds_done == len(self.rounds) else 1
             values = self.source.at_hits(alone, max(1, round(rays / self._hits.per_pixel)))
             device.launch(kernels.place_irradiance, len(alone), [values, device.array(alone, int)], [irradiance])
+            self._smooth(uncovered, rays, irradiance)
         device.launch(kernels.reflect_irradiance, count, [irradiance, self._albedo], [reflected])
         return reflected
 
@@ -169,6 +175,18 @@ class RecordCache:
     def all_counts(self) -> dict[str, int]:
         """Records, hits without one, and rays."""
         return self.counts | self.source.counts
+
+    def _smooth(self, uncovered: wp.array, rays: int, irradiance: wp.array) -> None:
+        """Filters irradiance at uncovered hits, where `rays` brought it to a pixel; fewer need a wider filter."""
+        radius = self.caching.smoothing * (SMOOTHED_RAYS / max(rays, self._hits.per_pixel)) ** 0.5
+        if radius <= 0.0:
+            return
+        device, count = self.device, self.size[0] * self.size[1]
+        pixels = filtering.Pixels()
+        pixels.position, pixels.normal, pixels.irradiance = (device.zeros(count, wp.vec3) for _ in range(3))
+        pixels.hits, pixels.wanted = device.zeros(count, int), device.zeros(count, int)
+        device.launch(filtering.average_hits, count, [self._struct, irradiance, uncovered], [pixels])
+        device.launch(filtering.regress, count, [self._struct, uncovered, pixels, radius], [irradiance])
 
     def _fill_round(self, places: list[tuple[int, int, int]]) -> None:
         device, caching = self.device, self.caching
@@ -203,17 +221,17 @@ class RecordCache:
         positions, normals, values = (
             device.array(array, wp.vec3) for array in (records.position, records.normal, records.irradiance)
         )
-        radii, clamped = device.array(records.radius, float), device.zeros(count, float)
-        device.launch(kernels.clamp_radii, count, [positions, radii, count], [clamped])
-        radius = clamped.numpy()
         tree = SplatTree(device, positions, normals, values, np.arange(count, dtype=np.int32), self.noise)
         order = tree.order.numpy()
+        clamped = device.zeros(count, float)
+        device.launch(kernels.clamp_radii, count, [tree.struct, device.array(records.radius[order], float)], [clamped])
+        radius = clamped.numpy()
         most = caching.tolerance * caching.overlap
-        tree.set_radius2(device.array(np.square(most * radius[order]), float))
+        tree.set_radius2(device.array(np.square(most * radius), float))
         tree.refit_as_balls()
-        packed = records.packed()
+        packed = records.packed()[order]
         packed[:, 0] = radius
         struct = kernels.Records()
-        struct.tree, struct.values = tree.struct, device.array(packed[order].ravel(), float)
+        struct.tree, struct.values = tree.struct, device.array(packed.ravel(), float)
         struct.most, struct.front = most, -((FRONT / most) ** 2)
         self._tree, self._kernel_records = tree, struct  # structs do not keep their arrays alive

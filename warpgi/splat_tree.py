@@ -69,6 +69,18 @@ class SplatTree:
         """The same as balls."""
         self._refit(flat=0.0)
 
+    def with_present_boxes(self) -> SplatTreeStruct:
+        """The same splats in the boxes that they have now, which no later refit changes."""
+        struct, own = SplatTreeStruct(), self.struct
+        struct.first, struct.blocks, struct.count, struct.block_count = (
+            own.first,
+            own.blocks,
+            own.count,
+            own.block_count,
+        )
+        struct.nodes = wp.clone(own.nodes)
+        return struct
+
     def _refit(self, flat: float) -> None:
         start, size = self.levels[0]
         blocks, nodes = self.struct.blocks, self.struct.nodes

@@ -142,8 +142,8 @@ def blurred_caustic(device: gi.Device) -> Value:
 
 
 def caustic_by_default(device: gi.Device) -> Value:
-    """k = 50, as it is unless told otherwise."""
-    return _blur(50, device)
+    """k = 20, as it is unless told otherwise."""
+    return _blur(20, device)
 
 
 def blotchy_caustic(device: gi.Device) -> Value:
@@ -164,7 +164,7 @@ ROWS = (
     Failure("photon-map", "leak", "the same, photons off the plane taken", None, leak_any_plane),
     Failure("photon-map", "leak", "the same, all normals and planes taken", None, leak_taking_all),
     Failure("photon-map", "caustic", "relMSE inside the ring, small lamp, k = 10", None, blotchy_caustic),
-    Failure("photon-map", "caustic", "relMSE inside the ring, small lamp, k = 50", None, caustic_by_default),
+    Failure("photon-map", "caustic", "relMSE inside the ring, small lamp, k = 20", None, caustic_by_default),
     Failure("photon-map", "caustic", "relMSE inside the ring, small lamp, k = 200", None, blurred_caustic),
     Failure("photon-map", "caustic", "share of pixels that stand out, 16 gather rays", None, gathered_dots),
 )

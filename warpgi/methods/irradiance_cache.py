@@ -57,6 +57,9 @@ class IrradianceCache:
     """Extrapolate records by their gradients."""
     fallback_rays: int = 64
     """Paths per pixel where no record serves, such as in foliage."""
+    smoothing: float = 0.0
+    """Radius [pixels] of the filter over what is gathered hit by hit, at 16 rays a pixel; it falls with the square root
+    of `fallback_rays`, as their noise does. It cleans foliage, but a thin wall does not stop it. 0: none."""
     photons: int = 0
     """Paths from the lights for photon maps, in which a record's rays end at their first hit: final gathering, with
     caustics read at the primary hits (Jensen 1996); `max_depth` is then not heeded; 0: none, paths go on."""
@@ -80,6 +83,7 @@ class IrradianceCache:
         checks.number("overlap", self.overlap, 1.0)
         checks.number("min_radius", self.min_radius, 0.0)
         checks.number("max_radius", self.max_radius, self.min_radius)
+        checks.number("smoothing", self.smoothing, 0.0, 100.0)
         checks.count("finest", self.finest, 1, COARSEST)
         if self.finest & (self.finest - 1):
             raise ValueError(f"finest is {self.finest}, expected a power of 2")
@@ -113,6 +117,7 @@ class IrradianceCache:
             largest=self.max_radius,
             finest=self.finest,
             gradients=self.gradients,
+            smoothing=self.smoothing,
         )
 
     def passes(self) -> tuple[int, str]:

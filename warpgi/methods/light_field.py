@@ -12,7 +12,6 @@ import warp as wp
 from warpgi import checks
 from warpgi.cached_reconstruction import CachedReconstruction
 from warpgi.device import Device
-from warpgi.device_scene import DeviceScene
 from warpgi.film import Film
 from warpgi.glossy_reconstruction import GlossyReconstruction
 from warpgi.irradiance import STRATA_BYTES
@@ -38,7 +37,7 @@ from warpgi.record_cache import BYTES_PER_HIT as CACHE_BYTES_PER_HIT
 from warpgi.record_cache import KERNELS as CACHE_KERNELS
 from warpgi.record_cache import Caching
 from warpgi.samples import SampleBuffer
-from warpgi.sampling import PRIMARY_BYTES, SECONDARY_BYTES, trace_primary_buffer, trace_sample_buffer
+from warpgi.sampling import PRIMARY_BYTES, SECONDARY_BYTES, path_settings, trace_primary_buffer, trace_sample_buffer
 from warpgi.traced_reconstruction import KERNELS as TRACED_KERNELS
 from warpgi.traced_reconstruction import TracedReconstruction
 
@@ -90,6 +89,9 @@ class LightField:
     """With `cache`: error up to which a record serves, see `IrradianceCache`."""
     scene_rays: bool = True
     """With `cache`, and where a scene is at hand: let it stop the rays of records, and splats only light them."""
+    smoothing: float = 3.5
+    """With `cache`: radius [pixels] of the filter over what is gathered hit by hit, at 16 rays a pixel; it falls with
+    the square root of `rays`, as their noise does. A thin wall does not stop it. 0: none."""
     record_rays: int = 256
     """With `cache`: rays of a record."""
     light_samples: int = 32
@@ -118,6 +120,7 @@ class LightField:
         checks.count("light_samples", self.light_samples)
         checks.number("tolerance", self.tolerance, 0.0, open_lower=True)
         checks.count("record_rays", self.record_rays)
+        checks.number("smoothing", self.smoothing, 0.0, 100.0)
         if self.cache and self.primary_rays:
             raise ValueError("cache and primary_rays are both set, expected one: a cache is for light on surfaces")
         if self.primary_hits is not None:
@@ -151,7 +154,8 @@ class LightField:
     @property
     def caching(self) -> Caching:
         """How records are placed."""
-        return IrradianceCache(rays=self.record_rays, tolerance=self.tolerance).caching
+        cache = IrradianceCache(rays=self.record_rays, tolerance=self.tolerance, smoothing=self.smoothing)
+        return cache.caching
 
     @property
     def hits(self) -> int:
@@ -195,7 +199,7 @@ class LightField:
             with_gloss=job.scene.scene.is_glossy and not self.photons and not self.cache,
         )
         caustics = light_by_photons(job, self.photons, samples, hits) if self.photons else None
-        state = self.reconstruction(samples, job.device, job.seed, hits, job.scene)
+        state = self.reconstruction(samples, job.device, job.seed, hits, job)
         if not isinstance(state, LensReconstruction):
             state.caustics = caustics
         return state
@@ -206,15 +210,16 @@ class LightField:
         device: Device,
         seed: int,
         hits: PrimaryHits | None = None,
-        scene: DeviceScene | None = None,
+        job: Job | None = None,
     ) -> AnyReconstruction:
         """Splats made of a sample buffer, ready for `gather`."""
         if self.primary_rays:
             return LensReconstruction(samples, device, self.preprocessing, seed)
         bandwidth = self.bandwidth and samples.bandwidth is not None and not self.cache
         make: Any = Reconstruction
-        if self.cache and self.scene_rays and scene is not None:
-            make = partial(TracedReconstruction, scene)
+        if self.cache and self.scene_rays and job is not None:
+            depths = (self.max_depth or NEVER) - 1, self.roulette_depth or NEVER
+            make = partial(TracedReconstruction, job, path_settings(job, *depths, self.sampler))
         elif samples.material is not None or bandwidth:
             make = partial(GlossyReconstruction, bandwidth=bandwidth)
         how = {"recursions": self.recursive, "recursive_rays": self.recursive_rays}

@@ -61,7 +61,8 @@ class PhotonMap:
 
     Direct light is sampled as in every method, and light over mirrors, glass and metal is followed from the camera to
     the first diffuse surface; there caustics are read from a map of their own, and other indirect light from the map
-    itself or, with `final_gather`, from where rays across the hemisphere meet surfaces. With `map_spp` below `spp` it
+    itself or, with `final_gather`, from where rays across the hemisphere meet surfaces, but for the light of caustics
+    there, which few rays would find. With `map_spp` below `spp` it
     is progressive: one map after the other, each with a smaller radius than the last, so that both noise and bias
     vanish with time at constant memory (Knaus, Zwicker 2011).
 
@@ -85,8 +86,8 @@ class PhotonMap:
     and blurs more."""
     radius: float | None = None
     """Radius [scene units] beyond which there are no photons in an estimate, above 0; None: none such."""
-    caustic_neighbours: int = 50
-    """`neighbours` for the map of caustics."""
+    caustic_neighbours: int = 20
+    """`neighbours` for the map of caustics, whose edges are sharp."""
     caustic_radius: float | None = None
     """`radius` for the map of caustics; None: a twentieth of the radius of the scene."""
     kernel: Kernel = Kernel.EPANECHNIKOV
@@ -230,19 +231,23 @@ class Mapping:
         shot = source.shoot(s.photons, number)
         self._count(shot, "photons")
         empty = np.zeros(0, np.int32)
+        direct, indirect, echo = (int(getattr(photon_kernels, name)) for name in ("DIRECT", "INDIRECT", "ECHO"))
         if s.final_gather:
-            every = self._tree(shot, np.arange(shot.count, dtype=np.int32))
+            # caustics are too small for gather rays: what they light is read as it is seen
+            every = self._tree(shot, shot.of_kind(direct, indirect, echo))
             # points of other paths: photons far from others stand for more of the surface, and are where light is
             # underestimated, so that the map's own would darken it
             points = source.shoot(-(-s.photons // s.gather_stride), number + OTHER_PATHS)
             maps.irradiance = self._tree(points, np.arange(points.count, dtype=np.int32))
             inputs = [self.job.scene.struct, every, maps.diffuse_look, maps.reach2, number]
             self.job.device.launch(kernels.estimate_at, maps.irradiance.block_count, inputs, [maps.irradiance])
-            self._trees[-1].refit_as_balls()
-            maps.diffuse = self._tree(shot, empty)
+            tree = self._trees[-1]
+            maps.places, maps.usual2 = tree.with_present_boxes(), float(np.median(tree.radii() ** 2))
+            tree.refit_as_balls()
+            maps.diffuse = self._tree(shot, shot.of_kind(echo))
         else:
-            maps.diffuse = self._tree(shot, shot.of_kind(int(photon_kernels.INDIRECT)))
-            maps.irradiance = self._tree(shot, empty)
+            maps.diffuse = self._tree(shot, shot.of_kind(indirect, echo))
+            maps.irradiance = maps.places = self._tree(shot, empty)
         if source.has_caustics and s.caustic_photons:
             shot = source.shoot_caustics(s.caustic_photons, number)
             self._count(shot, "caustic_photons")
@@ -289,7 +294,7 @@ def gathering_map(job: Job, photons: int) -> Mapping:
 
 
 def caustics_at_hits(mapping: Mapping, hits: PrimaryHits) -> wp.array:
-    """The caustic light that each primary hit reflects, vec3 on the device."""
+    """The light of caustics, there and elsewhere, that each primary hit reflects, vec3 on the device."""
     device = mapping.job.device
     origins, normals, albedo = (device.array(a, wp.vec3) for a in (hits.origin, hits.normal, hits.albedo))
     caustics = device.zeros(len(hits.origin), wp.vec3)
@@ -302,7 +307,8 @@ def light_by_photons(job: Job, photons: int, samples: SampleBuffer, hits: Primar
     """Gives the samples' secondary rays the radiance that a photon map knows at their ends.
 
     Returns:
-        The caustic light that each primary hit reflects, vec3 on the device: the maps' samples hold none.
+        The light of caustics, there and elsewhere, that each primary hit reflects, vec3 on the device: the maps'
+        samples hold none.
     """
     device = job.device
     mapping = gathering_map(job, photons)
