@@ -1,4 +1,4 @@
-"""A tree of eight children a node over points in Hilbert order, built and refit level by level.
+"""A tree of eight children a node over points in an order of neighbours, built and refit level by level.
 
 Blocks of eight neighbouring points are its leaves; every node above covers eight of the level below, so that the
 shape follows from the number of points alone and only boxes need computing.
@@ -14,71 +14,7 @@ BLOCK_STRIDE = wp.constant(80)  # x, y, z, normal x, y, z, radius squared, radia
 RADIUS_ROW = wp.constant(48)
 UNUSED = wp.constant(-1.0)  # radius squared of an empty lane
 
-HILBERT_BITS = wp.constant(10)  # a dimension
 EMPTY = wp.constant(1.0e30)
-
-
-@wp.func
-def hilbert_code(x: int, y: int, z: int):
-    """Place on the three-dimensional Hilbert curve (Skilling 2004, transposed axes interleaved)."""
-    a = x
-    b = y
-    c = z
-    q = int(1) << (HILBERT_BITS - 1)
-    while q > 1:
-        p = q - 1
-        if (a & q) != 0:
-            a = a ^ p
-        if (b & q) != 0:
-            a = a ^ p
-        else:
-            t = (a ^ b) & p
-            a = a ^ t
-            b = b ^ t
-        if (c & q) != 0:
-            a = a ^ p
-        else:
-            t = (a ^ c) & p
-            a = a ^ t
-            c = c ^ t
-        q = q >> 1
-    b = b ^ a
-    c = c ^ b
-    t = int(0)
-    q = int(1) << (HILBERT_BITS - 1)
-    while q > 1:
-        if (c & q) != 0:
-            t = t ^ (q - 1)
-        q = q >> 1
-    a = a ^ t
-    b = b ^ t
-    c = c ^ t
-    code = int(0)
-    for i in range(HILBERT_BITS):
-        bit = HILBERT_BITS - 1 - i
-        code = (code << 3) | (((a >> bit) & 1) << 2) | (((b >> bit) & 1) << 1) | ((c >> bit) & 1)
-    return code
-
-
-@wp.kernel
-def order_keys(
-    offset: int,
-    points: wp.array[wp.vec3],
-    source: wp.array[int],
-    low: wp.vec3,
-    inverse_size: float,
-    keys: wp.array[int],
-    values: wp.array[int],
-):
-    """One thread writes the curve's key of one point and its number in `points`."""
-    i = offset + wp.tid()
-    p = (points[source[i]] - low) * inverse_size
-    last = (int(1) << HILBERT_BITS) - 1
-    x = wp.clamp(int(p[0] * float(last)), 0, last)
-    y = wp.clamp(int(p[1] * float(last)), 0, last)
-    z = wp.clamp(int(p[2] * float(last)), 0, last)
-    keys[i] = hilbert_code(x, y, z)
-    values[i] = source[i]
 
 
 @wp.kernel
@@ -96,10 +32,13 @@ def fill_blocks(
     place = (i // LANES) * BLOCK_STRIDE + i % LANES
     if i < count:
         j = order[i]
+        p = points[j]
+        n = normals[j]
+        light = radiance[j]
         for axis in range(3):
-            blocks[place + axis * LANES] = points[j][axis]
-            blocks[place + (3 + axis) * LANES] = normals[j][axis]
-            blocks[place + (7 + axis) * LANES] = radiance[j][axis]
+            blocks[place + axis * LANES] = p[axis]
+            blocks[place + (3 + axis) * LANES] = n[axis]
+            blocks[place + (7 + axis) * LANES] = light[axis]
         blocks[place + RADIUS_ROW] = 0.0
     else:
         for row in range(10):

@@ -252,9 +252,8 @@ NEAREST_COVERING = (
                     found = block * 8 + j;
 """,
         FACING + " & (m2[j] <= p[48 + j])",
-    )
-    .replace("(d2[j] > 0.0f) & ", "")
-    .replace("met[j] = (int)(d2[j] < worst)", "met[j] = (int)(d2[j] == 0.0f)")
+        enter=" & (d2[j] == 0.0f)",
+    ).replace("(d2[j] > 0.0f) & ", "")
     + "    return found;\n"
 )
 

@@ -15,7 +15,7 @@ from warpgi.kernels.light_field import GATHER_PAIR, Gathered, Receivers, Sky, sk
 from warpgi.kernels.rng import SOBOL, make_sampler, sample_2d
 from warpgi.kernels.sampling import make_frame, square_to_cosine_hemisphere, to_world
 from warpgi.kernels.scene import DIFFUSE, ShapeRecord
-from warpgi.kernels.splats import SplatTree, nearest_distance2, nearest_facing, splat_radiance
+from warpgi.kernels.splats import SplatTree, nearest_facing, splat_radiance
 
 wp.set_module_options({"enable_backward": False})
 
@@ -194,9 +194,12 @@ def write_cone(cones: wp.array[float], node: int, child: int, low: wp.vec3, high
 
 @wp.kernel
 def size_lobes(offset: int, lobes: Lobes, k: int, radius2: wp.array[float]):
-    """One thread finds one lobe's squared radius: the distance of its k-th neighbour of like direction."""
+    """One thread finds one lobe's squared radius: the distance of its k-th neighbour of like direction.
+
+    It comes as that of its k-th neighbour of any direction.
+    """
     i = offset + wp.tid()
-    near2 = nearest_distance2(lobes.tree, i, k, lobes.stretch)
+    near2 = radius2[i]
     r2 = float(-1.0)
     if near2 >= 0.0:
         farthest2 = near2 * (LOOKED_AT / float(k)) * (1.0 + 1.0e-3)

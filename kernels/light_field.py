@@ -9,7 +9,6 @@ from warpgi.kernels.sampling import PI, make_frame, square_to_cosine_hemisphere,
 from warpgi.kernels.splats import (
     SplatTree,
     first_surface,
-    nearest_distance2,
     nearest_facing,
     shrink_crossed,
     splat_radiance,
@@ -62,15 +61,12 @@ def sky_radiance(sky: Sky, d: wp.vec3):
 
 
 @wp.kernel
-def size_splats(offset: int, tree: SplatTree, rays: Rays, k: int, stretch: float, radius2: wp.array[float]):
-    """One thread finds one splat's squared radius: the distance of its k-th neighbour, the splat itself counted."""
+def size_lone_splats(offset: int, rays: Rays, radius2: wp.array[float]):
+    """One thread sizes one splat that has no neighbour: something of the size of what it was seen from."""
     i = offset + wp.tid()
-    r2 = nearest_distance2(tree, i, k, stretch)
-    if r2 < 0.0:
-        # no neighbour at all: something of the size of what it was seen from
+    if radius2[i] < 0.0:
         half = 0.5 * wp.length(rays.hits[rays.order[i]] - rays.origins[rays.order[i]])
-        r2 = half * half
-    radius2[i] = r2
+        radius2[i] = half * half
 
 
 @wp.func
@@ -87,10 +83,18 @@ def retrace(tree: SplatTree, rays: Rays, i: int, slot: int, radius2: wp.array[fl
 
 @wp.kernel
 def shrink_splats(
-    offset: int, slot: int, tree: SplatTree, rays: Rays, margin: float, noise: float, radius2: wp.array[float]
+    offset: int,
+    slot: int,
+    tree: SplatTree,
+    rays: Rays,
+    margin: float,
+    noise: float,
+    first: int,
+    step: int,
+    radius2: wp.array[float],
 ):
     """One thread retraces one input ray and shrinks, in its slot, the splats that it crosses before its end."""
-    retrace(tree, rays, offset + wp.tid(), slot, radius2, margin, noise)
+    retrace(tree, rays, first + (offset + wp.tid()) * step, slot, radius2, margin, noise)
 
 
 @wp.kernel

@@ -137,10 +137,12 @@ def shrink_moving(
     rays: Rays,
     margin: float,
     noise: float,
+    first: int,
+    step: int,
     radius2: wp.array[float],
 ):
     """One thread retraces one input ray at its time and shrinks, in its slot, the splats that it crosses."""
-    i = offset + wp.tid()
+    i = first + (offset + wp.tid()) * step
     j = rays.order[i]
     o = rays.origins[j]
     d = rays.hits[j] - o

@@ -10,8 +10,6 @@ from warpgi.kernels.lanes import LANES_HEAD
 
 wp.set_module_options({"enable_backward": False})
 
-MAX_NEIGHBOURS = 32  # the length of the arrays in NEAREST
-
 vec10 = wp.types.vector(length=10, dtype=wp.float32)
 
 
@@ -24,17 +22,14 @@ class SplatTree:
     block_count: int
 
 
-# The search for what is nearest to (cx, cy, cz) in the metric |d|^2 + stretch (d.n)^2: every lane that ACCEPT takes and
-# that is nearer than `worst` is handed to KEEP, which lowers `worst`. `block0` is where to begin, -1: at the root. NODE
-# sees each node (`p`, and its `first` child) before its children, of which it enters those that ENTER takes; BLOCK sees
-# each block before its lanes.
-SEARCH_HEAD = """
+# Whose turn it is in a search: the blocks about `block0` (-1: none), which bound it, then what the stack holds that
+# may be nearer than `worst`. What follows is for a block.
+SEARCH_TURNS = """
     int stack[128];
     float entry[128];
     stack[0] = 0;
     entry[0] = 0.0f;
     int top = 1;
-    // the three blocks around `block0` first: they bound the search
     const int begin = block0 > 0 ? block0 - 1 : 0;
     const int end = block0 < 0 ? -1 : (block0 + 1 < tree.block_count ? block0 + 1 : block0);
     int next = begin;
@@ -57,7 +52,20 @@ SEARCH_HEAD = """
         }
         if (block >= 0) {
             const float* p = tree.blocks.data + (size_t)block * 80;
-            BLOCK
+"""
+
+# The search for what is nearest to (cx, cy, cz) in the metric |d|^2 + stretch (d.n)^2: every lane that ACCEPT takes and
+# that is nearer than `worst` is handed to KEEP, which lowers `worst`. `block0` is where to begin, -1: at the root. NODE
+# sees each node (`p`, and its `first` child) before its children, of which it enters those that ENTER takes; BLOCK sees
+# each block before its lanes.
+SEARCH_HEAD = (
+    """
+    // rows of a box's corners that lie lowest and highest along n
+    const int lx = nx < 0.0f ? 24 : 0, ly = ny < 0.0f ? 32 : 8, lz = nz < 0.0f ? 40 : 16;
+    const int hx = 24 - lx, hy = 40 - ly, hz = 56 - lz;
+"""
+    + SEARCH_TURNS
+    + """            BLOCK
             float d2[8], m2[8];
             int met[8];
             for (int j = 0; j < 8; ++j) {
@@ -72,6 +80,7 @@ SEARCH_HEAD = """
                 const int j = next_lane(mask);
                 if (m2[j] < worst) {
 """
+)
 SEARCH_TAIL = """
                 }
             }
@@ -79,26 +88,31 @@ SEARCH_TAIL = """
             const float* p = tree.nodes.data + (size_t)current * 48;
             const int first = tree.first.data[current];
             NODE
-            float d2[8];
+            float d2[8], m2[8];
             int met[8];
             for (int j = 0; j < 8; ++j) {
                 const float dx = larger(larger(p[j] - cx, cx - p[24 + j]), 0.0f);
                 const float dy = larger(larger(p[8 + j] - cy, cy - p[32 + j]), 0.0f);
                 const float dz = larger(larger(p[16 + j] - cz, cz - p[40 + j]), 0.0f);
                 d2[j] = dx * dx + dy * dy + dz * dz;
-                met[j] = (int)((d2[j] < worst)ENTER);
+                // no corner of the box lies deeper below the plane, or higher above it, than these
+                const float low = (p[lx + j] - cx) * nx + (p[ly + j] - cy) * ny + (p[lz + j] - cz) * nz;
+                const float high = (p[hx + j] - cx) * nx + (p[hy + j] - cy) * ny + (p[hz + j] - cz) * nz;
+                const float along = larger(larger(low, -high), 0.0f);
+                m2[j] = d2[j] + stretch * along * along;
+                met[j] = (int)((m2[j] < worst)ENTER);
             }
             const int base = top;
             unsigned mask = lane_mask(met);
             while (mask) {
                 const int j = next_lane(mask);
                 int slot = top++;
-                while (slot > base && entry[slot - 1] < d2[j]) {
+                while (slot > base && entry[slot - 1] < m2[j]) {
                     entry[slot] = entry[slot - 1];
                     stack[slot] = stack[slot - 1];
                     --slot;
                 }
-                entry[slot] = d2[j];
+                entry[slot] = m2[j];
                 stack[slot] = first >= 0 ? first + j : first - j;
             }
         }
@@ -113,43 +127,6 @@ def search(keep: str, accept: str = "", node: str = "", enter: str = "", block: 
     for name, code in (("ACCEPT", accept), ("BLOCK", block), ("NODE", node), ("ENTER", enter)):
         head, tail = head.replace(name, code), tail.replace(name, code)
     return head + keep + tail
-
-
-# Squared distance to the k-th neighbour in that metric, the sample itself counted, and in Euclid's; samples at the
-# very same place are not neighbours, or they would vanish, nor are those that face elsewhere: they are of another
-# surface, or of the other side of something thin.
-NEAREST = (
-    LANES_HEAD
-    + """
-    const int block0 = i / 8;
-    const float* q = tree.blocks.data + (size_t)block0 * 80 + i % 8;
-    const float cx = q[0], cy = q[8], cz = q[16], nx = q[24], ny = q[32], nz = q[40];
-    const int want = k - 1;
-    float metric[32], plain[32];
-    int found = 0;
-    float worst = 1.0e30f;
-"""
-    + search(
-        """
-                    int slot = found < want ? found++ : want - 1;
-                    while (slot > 0 && metric[slot - 1] > m2[j]) {
-                        metric[slot] = metric[slot - 1];
-                        plain[slot] = plain[slot - 1];
-                        --slot;
-                    }
-                    metric[slot] = m2[j];
-                    plain[slot] = d2[j];
-                    if (found == want)
-                        worst = metric[want - 1];
-""",
-        accept=" & (p[24 + j] * nx + p[32 + j] * ny + p[40 + j] * nz > 0.1f)",
-    )
-    + "    return found > 0 ? plain[found - 1] : -1.0f;\n"
-)
-
-
-@wp.func_native(NEAREST)
-def nearest_distance2(tree: SplatTree, i: int, k: int, stretch: float) -> float: ...
 
 
 # Walks the boxes along a ray and hands each block that it meets beyond `start` and before `limit` on, nearest first.

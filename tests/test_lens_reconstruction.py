@@ -185,7 +185,8 @@ def test_the_sky_behind_is_kept(method):
     image = gi.render(scene, method, size=SIZE).image
     expected = gi.render(scene, gi.PathTracing(spp=512, max_depth=1), size=SIZE).image
     assert image.mean() == pytest.approx(expected.mean(), rel=0.03)
-    assert np.allclose(image[:, -6:], (0.2, 0.4, 0.9), rtol=1e-4)
+    # out of the reach of samples at the layer's rim
+    assert np.allclose(image[:, -5:], (0.2, 0.4, 0.9), rtol=1e-4)
 
 
 def test_radius_of_the_earlier_method_is_the_patterns_dispersion():

@@ -238,3 +238,28 @@ def test_settings_out_of_range(settings, message):
     """Each setting has its range."""
     with pytest.raises(ValueError, match=message):
         gi.MeshlessHierarchy(**settings)
+
+
+def test_paths_at_points():
+    """With path-traced points the mean picture is path tracing's, within noise and a few per cent, and no splat is
+    made; the tolerance may be 0, where every hit is a point, or not."""
+    scene, size = gi.scenes.cornell_box(), (16, 16)
+    truth = [
+        gi.render(scene, gi.PathTracing(spp=64), size, seed).layers["indirect"].mean(dtype=np.float64)
+        for seed in range(10, 14)
+    ]
+    for settings in ({"tolerance": 0.0, "rays": 8}, {"tolerance": 0.4, "rays": 64}):
+        method = gi.MeshlessHierarchy(spp=2, light_samples=2, paths=True, **settings)
+        renders = [gi.render(scene, method, size, seed) for seed in range(4)]
+        means = [render.layers["indirect"].mean(dtype=np.float64) for render in renders]
+        error = np.hypot(np.std(means, ddof=1), np.std(truth, ddof=1)) / 2.0
+        assert abs(np.mean(means) - np.mean(truth)) < 4.4 * error + 0.02 * np.mean(truth)
+        assert "splats" not in renders[0].counts
+        assert renders[0].counts["point_rays"] == method.rays * renders[0].counts["points"]
+
+
+def test_paths_need_a_scene():
+    """A sample buffer alone has nothing to trace paths in."""
+    samples = gi.sample(gi.scenes.cornell_box(), spp=1, size=(8, 8))
+    with pytest.raises(ValueError, match="paths is True"):
+        gi.reconstruct(samples, gi.MeshlessHierarchy(paths=True))

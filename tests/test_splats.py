@@ -11,7 +11,7 @@ from warpgi.kernels import light_field as kernels
 from warpgi.kernels.splats import SplatTree as SplatTreeStruct
 from warpgi.kernels.splats import first_surface, nearest_facing, vec10
 from warpgi.reconstruction import NOISE_ULPS
-from warpgi.splat_tree import LANES, SplatTree
+from warpgi.splat_tree import LANES, SHRINK_PASSES, SplatTree, compact_order
 
 wp.set_module_options({"enable_backward": False})
 
@@ -165,6 +165,32 @@ def test_tree_holds_every_splat_once_in_boxes_that_contain_its_disc(count):
     expected[:, 6:9] = splats.radiance[splats.order]
     np.testing.assert_array_equal(lanes[:, [0, 1, 2, 3, 4, 5, 7, 8, 9]], expected)
     np.testing.assert_allclose(lanes[:, 6], size[splats.order] ** 2, rtol=1e-6)
+
+
+@pytest.mark.parametrize("sorted_above", [None, 1024])
+@pytest.mark.parametrize("count", [1, 8, 9, 500, 5000])
+def test_order_halves_every_segment_across_its_longest_side(count, sorted_above):
+    """Nothing in the first half of a segment lies beyond its second half, in order found by threads or by sorting."""
+    points = np.random.default_rng(count).random((count + 3, 3)).astype(np.float32) * np.float32([1.0, 2.0, 0.5])
+    points[::3, 0] = 0.25  # many in one plane
+    device, chosen = gi.Device("cpu"), np.arange(3, count + 3, dtype=np.int32)
+    order = compact_order(device, device.array(points, wp.vec3), chosen, sorted_above).numpy()
+    assert sorted(order) == list(chosen)
+    size, places = LANES, points[order]
+    while size < count:
+        size *= 2
+        for begin in range(0, count - size // 2, size):
+            part = places[begin : begin + size]
+            axis = np.argmax(np.ptp(part, axis=0))
+            first, second = part[: size // 2, axis], part[size // 2 :, axis]
+            # sort keys tell places apart that lie a step from each other
+            assert first.max() <= second.min() + (np.ptp(part[:, axis]) * 2.0**-22 if sorted_above else 0.0)
+
+
+def test_every_input_ray_shrinks_in_one_pass():
+    """The passes share the places of the tree out."""
+    places = np.concatenate([np.arange(first, 1000, step) for parts in SHRINK_PASSES for first, step in parts])
+    assert sorted(places) == list(range(1000))
 
 
 def test_levels_have_an_eighth_of_the_nodes_below():

@@ -139,7 +139,7 @@ class LobeTree(SplatTree):
         """Radii from the k-th nearest neighbour of like direction (Lehtinen et al. 2012, section 2.2)."""
         if self.count == 0:
             return
-        radius2 = self.device.zeros(self.count, float)
+        radius2 = self.nearest_distances(k, lobes.stretch)
         self.device.launch(kernels.size_lobes, self.count, [lobes, k], [radius2])
         self.set_radius2(radius2)
 

@@ -5,6 +5,8 @@ Lehtinen et al. 2012, section 3.4; no scene is needed.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import warp as wp
 
@@ -14,10 +16,10 @@ from warpgi.kernels import light_field as still_kernels
 from warpgi.kernels import moving_splats as moving_kernels
 from warpgi.reconstruction import NOISE_ULPS, Preprocessing, make_sky
 from warpgi.samples import SampleBuffer
-from warpgi.splat_tree import LANES, SplatTree
+from warpgi.splat_tree import LANES, SIZING_KERNELS, TREE_KERNELS, SplatTree
 
 #: What it launches for still and for moving buffers, to be compiled first: a kernel of each module.
-STILL_KERNELS = (lens.reconstruct_still_lens, still_kernels.size_splats, bvh.fill_blocks)
+STILL_KERNELS = (lens.reconstruct_still_lens, *TREE_KERNELS, *SIZING_KERNELS)
 MOVING_KERNELS = (*STILL_KERNELS, moving_kernels.reconstruct_moving_lens)
 
 # Squared part of the distance to the nearest ray that passed it within which a sample covers by itself: with it a
@@ -172,15 +174,7 @@ class _MovingSplatTree(SplatTree):
             device.launch(moving_kernels.fit_moving_leaves, size, inputs, [nodes])
             self.fit_levels(nodes)
 
-    def shrink(self, rays: still_kernels.Rays, margin: float, escaped: np.ndarray, extent: float) -> None:
-        """Shrinks what input rays cross at their times (Lehtinen et al. 2012, section 2.3.1)."""
-        if self.count == 0:
-            return
-        device, slots = self.device, self.device.slots
-        radius2 = wp.full(slots * self.count, 3.0e38, dtype=float, device=device.warp)
-        device.launch(bvh.read_radii, self.count, [self.struct.blocks], [radius2[: self.count]])
-        inputs = [self.struct, self.motion, rays, margin, self.noise]
-        device.launch(moving_kernels.shrink_moving, self.count, inputs, [radius2], with_slot=True)
-        inputs = [self.struct, self.motion, rays, device.array(escaped, int), max(margin * extent, self.noise)]
-        device.launch(moving_kernels.shrink_moving_by_escaped, len(escaped), inputs, [radius2], with_slot=True)
-        self.set_radius2(radius2, slots)
+    _shrink_kernels = (moving_kernels.shrink_moving, moving_kernels.shrink_moving_by_escaped)
+
+    def _walked(self) -> list[Any]:
+        return [self.struct, self.motion]

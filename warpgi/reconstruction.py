@@ -12,11 +12,10 @@ import numpy as np
 import warp as wp
 
 from warpgi.device import Device
-from warpgi.kernels import bvh
 from warpgi.kernels import light_field as kernels
 from warpgi.kernels.hemisphere import Hemispheres
 from warpgi.samples import NO_HIT, SampleBuffer
-from warpgi.splat_tree import SplatTree
+from warpgi.splat_tree import SIZING_KERNELS, TREE_KERNELS, SplatTree
 
 # Position rounding in units of float32's spacing at the largest coordinate: positions come from a few operations.
 NOISE_ULPS = 4.0 * 2.0**-24
@@ -295,7 +294,7 @@ def make_sky(samples: SampleBuffer, escaped: np.ndarray, device: Device) -> kern
 
 
 #: What a reconstruction launches, to be compiled first: a kernel of each module.
-KERNELS = (kernels.reconstruct, bvh.fill_blocks)
+KERNELS = (kernels.reconstruct, *TREE_KERNELS, *SIZING_KERNELS)
 
 
 def pixel_means(samples: SampleBuffer, values: np.ndarray) -> np.ndarray:

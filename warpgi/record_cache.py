@@ -15,14 +15,13 @@ import warp as wp
 
 from warpgi.device import Device
 from warpgi.irradiance import IrradianceSource
-from warpgi.kernels import bvh
 from warpgi.kernels import irradiance_cache as kernels
 from warpgi.kernels import regression_filter as filtering
 from warpgi.kernels.hemisphere import sum_strata
 from warpgi.reconstruction import NOISE_ULPS, PrimaryHits
 from warpgi.records import Records
 from warpgi.samples import NO_HIT
-from warpgi.splat_tree import SplatTree
+from warpgi.splat_tree import TREE_KERNELS, SplatTree
 
 #: Pixels between those of the coarsest grid.
 COARSEST = 32
@@ -36,7 +35,7 @@ SMOOTHED_RAYS = 16
 FRONT = 0.01
 
 #: What a cache launches, to be compiled first: a kernel of each module.
-KERNELS = (kernels.interpolate, sum_strata, filtering.regress, bvh.fill_blocks)
+KERNELS = (kernels.interpolate, sum_strata, filtering.regress, *TREE_KERNELS)
 
 
 @dataclass(frozen=True)

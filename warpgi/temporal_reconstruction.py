@@ -6,14 +6,13 @@ import numpy as np
 import warp as wp
 
 from warpgi.device import Device
-from warpgi.kernels import bvh
 from warpgi.kernels import temporal_light_field as kernels
 from warpgi.lens_reconstruction import LensSampling
 from warpgi.samples import SampleBuffer
-from warpgi.splat_tree import LANES, hilbert_order, tree_levels
+from warpgi.splat_tree import LANES, TREE_KERNELS, compact_order, tree_levels
 
 #: What it launches, to be compiled first: a kernel of each module.
-KERNELS = (kernels.reconstruct_lines, bvh.order_keys)
+KERNELS = (kernels.reconstruct_lines, *TREE_KERNELS)
 
 # Step of the search for the largest hole [pixels].
 STEP = 0.25
@@ -41,7 +40,7 @@ class TemporalReconstruction(LensSampling):
         lines.depth, lines.radiance = device.array(depth, float), device.array(samples.radiance, wp.vec3)
         block_count = max(1, -(-len(used) // LANES))
         # blurred as much as they lie apart: what moves over the screen with the lens alike comes together
-        order = hilbert_order(device, lines.place, used)
+        order = compact_order(device, lines.place, used)
         levels, first = tree_levels(block_count)
         tree = kernels.LineTree()
         tree.first = device.array(first, int)

@@ -50,6 +50,19 @@ def splotches_light_field(device: gi.Device) -> Value:
     return mean_value(_splotches(method, device))
 
 
+def sparse_gradients(device: gi.Device) -> Value:
+    """Low-frequency error with gradients over that without, where records are few and their noise is not what shows."""
+    scene = gi.scenes.cornell_box()
+    truth = _low(make_reference(scene, SIZE, 1024, device=device).image.astype(np.float64))
+    ratios = []
+    for seed in range(4):
+        methods = [gi.IrradianceCache(rays=1024, tolerance=0.6, gradients=on) for on in (True, False)]
+        pictures = [_low(indirect(scene, method, SIZE, seed, device).astype(np.float64)) for method in methods]
+        errors = [np.sqrt(np.mean(np.square(picture - truth))) for picture in pictures]
+        ratios.append(errors[0] / errors[1])
+    return mean_value(ratios)
+
+
 def leak(device: gi.Device) -> Value:
     """Mean light of the dark room over that of the lit one, 4 columns beside the wall left out."""
     scene, _ = gi.scenes.leak(open_front=True)
@@ -113,6 +126,7 @@ ROWS = (
     _row("cornell-box", f"{BESIDE}, no gradients", None, splotches),
     _row("cornell-box", f"{BESIDE}, gradients", 1.0, splotches_gradients),
     _row("cornell-box", f"{BESIDE}, records from splats", 0.8, splotches_light_field),
+    _row("cornell-box", "9 x 9 box error at tolerance 0.6, gradients over none", 0.8, sparse_gradients),
     _row("leak, open front", "light in the dark room, of the lit one's", 0.001, leak),
     _row("lit cube", "RMS error around it over the mean", 2.0, detail),
     _row("lit cube", "the same at half the tolerance", None, detail_half),

@@ -12,8 +12,8 @@ from warpgi import checks
 from warpgi.device import Device
 from warpgi.film import Film
 from warpgi.job import Job
+from warpgi.kernels.neighbours import MAX_NEIGHBOURS
 from warpgi.kernels.samples import trace_samples
-from warpgi.kernels.splats import MAX_NEIGHBOURS
 from warpgi.methods.path import NEVER, Sampler
 from warpgi.reconstruction import BYTES_PER_SAMPLE, KERNELS, Preprocessing, Reconstruction, pixel_means
 from warpgi.samples import SampleBuffer

@@ -17,9 +17,9 @@ from warpgi.glossy_reconstruction import GlossyReconstruction
 from warpgi.irradiance import STRATA_BYTES
 from warpgi.job import Job
 from warpgi.kernels.light_field import add_reflected
+from warpgi.kernels.neighbours import MAX_NEIGHBOURS
 from warpgi.kernels.primary_samples import trace_primary_samples
 from warpgi.kernels.samples import trace_samples
-from warpgi.kernels.splats import MAX_NEIGHBOURS
 from warpgi.lens_reconstruction import PRIMARY_SAMPLE_BYTES, LensReconstruction
 from warpgi.methods.irradiance_cache import IrradianceCache
 from warpgi.methods.path import NEVER, Sampler, check_paths

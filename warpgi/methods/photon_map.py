@@ -13,7 +13,7 @@ import warp as wp
 from warpgi import checks
 from warpgi.film import Film
 from warpgi.job import Job
-from warpgi.kernels import bvh, density, rng
+from warpgi.kernels import density, rng
 from warpgi.kernels import photon_map as kernels
 from warpgi.kernels import photons as photon_kernels
 from warpgi.kernels.scene import OFFSET_ULPS
@@ -21,7 +21,7 @@ from warpgi.methods.path import Sampler
 from warpgi.photons import BATCH_BYTES, PHOTON_BYTES, TREE_BYTES, PhotonSource
 from warpgi.reconstruction import PrimaryHits
 from warpgi.samples import SampleBuffer
-from warpgi.splat_tree import SplatTree
+from warpgi.splat_tree import TREE_KERNELS, SplatTree
 
 # Photons that a path leaves behind, for a guess at memory before any is traced.
 PHOTONS_PER_PATH = 4
@@ -152,7 +152,7 @@ class PhotonMap:
     @property
     def kernels(self) -> tuple[wp.Kernel, ...]:
         """What it launches: a kernel of each module."""
-        return (kernels.see, photon_kernels.shoot, bvh.fill_blocks)
+        return (kernels.see, photon_kernels.shoot, *TREE_KERNELS)
 
     def passes(self) -> tuple[int, str]:
         """Samples per pixel, the unit of its passes."""
