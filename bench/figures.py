@@ -111,7 +111,7 @@ def lens_methods(budget: Budget) -> dict[str, Any]:
     """The two that reconstruct from camera rays, the earlier one first."""
     return {
         "temporal light field": gi.TemporalLightField(spp=1, rays=budget.rays),
-        "light field": gi.LightField(spp=1, rays=budget.rays, neighbours=8, primary_rays=True),
+        "light field": gi.LightField(spp=1, rays=budget.rays, primary_rays=True),
     }
 
 

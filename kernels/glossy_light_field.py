@@ -50,6 +50,31 @@ class Surfaces:
     reflectance: wp.array[wp.vec3]
 
 
+@wp.struct
+class Beyond:
+    """What mirrors show: splats of the segments after them, in a tree of their own; empty where none was met."""
+
+    mirror: wp.array[wp.vec3]  # what splats in the tree that resolves visibility reflect as mirrors, 0: they are none
+    tree: SplatTree
+    lobes: Lobes
+    sky: Sky
+    none: wp.array[wp.vec3]  # a mirror behind the mirror is read as a very sharp lobe
+    shift: wp.vec3  # from positions in this tree to positions in that one
+    noise: float
+
+
+@wp.struct
+class Seen:
+    """What a reconstruction ray found."""
+
+    light: wp.vec3
+    mirror: wp.vec3  # what reflects the rest, 0: there is none
+    p: wp.vec3  # on the mirror
+    n: wp.vec3
+    input: wp.vec3  # that the input saw in it, for where nothing is found beyond
+    counts: wp.vec4i
+
+
 @wp.func
 def mirrored(d: wp.vec3, n: wp.vec3):
     return d - n * (2.0 * wp.dot(d, n))
@@ -208,11 +233,72 @@ def size_lobes(offset: int, lobes: Lobes, k: int, radius2: wp.array[float]):
     radius2[i] = wp.where(r2 < 0.0, wp.max(near2, 0.0), r2)
 
 
+@wp.func
+def look(
+    tree: SplatTree,
+    lobes: Lobes,
+    sky: Sky,
+    mirror: wp.array[wp.vec3],
+    o: wp.vec3,
+    d: wp.vec3,
+    noise: float,
+    keep_one: float,
+    keep_two: float,
+):
+    """Light that comes along a ray, from the first surface or the sky; of a mirror, what it is and where it was met."""
+    seen = Seen()
+    s = glossy_surface(tree, lobes.kappa, o, d, noise, keep_one, keep_two)
+    seen.counts[2] = int(s[4])
+    seen.counts[3] = int(s[5])
+    share = float(0.0)  # of the surface that is glossy
+    distance = float(0.0)
+    normal = d
+    splat = int(-1)
+    if s[6] > 0.0:
+        splat = nearest_facing(tree, o + s[6] * d, d)
+    if splat >= 0:
+        # what faces away belongs to the other side of something thin, whose light may be quite another
+        seen.light = splat_radiance(tree, splat)
+        if lobes.kappa[splat] > 0.0:
+            share = 1.0
+            distance = s[6]
+            normal = splat_normal(tree, splat)
+    elif s[3] > 0.0:
+        seen.light = wp.vec3(s[0], s[1], s[2]) / s[3]
+        if s[7] > 0.0:
+            share = s[7] / s[3]
+            distance = s[8] / s[7]
+            normal = wp.normalize(wp.vec3(s[9], s[10], s[11]))
+            splat = wp.cast(s[12], wp.int32)
+    elif sky.size > 0:
+        seen.light = sky_radiance(sky, d)
+        seen.counts[1] = 1
+    else:
+        seen.counts[0] = 1
+    if share > 0.0:
+        if wp.dot(normal, d) > 0.0:
+            normal = -normal
+        seen.p = o + distance * d
+        seen.n = normal
+        if mirror.shape[0] > 0:
+            seen.mirror = mirror[splat] * share
+            seen.input = lobes.radiance[splat] * share
+        if seen.mirror[0] + seen.mirror[1] + seen.mirror[2] <= 0.0:
+            axis = mirrored(d, normal)
+            lobe = largest_lobe(lobes.tree, lobes.axes, lobes.cones, seen.p, normal, d, axis, distance, lobes.stretch)
+            if lobe >= 0:
+                seen.light = seen.light + splat_radiance(lobes.tree, lobe) * share
+            else:
+                seen.light = seen.light + lobes.radiance[splat] * share
+    return seen
+
+
 @wp.kernel
 def reconstruct_glossy(
     offset: int,
     tree: SplatTree,
     lobes: Lobes,
+    beyond: Beyond,
     surfaces: Surfaces,
     sky: Sky,
     receivers: Receivers,
@@ -227,7 +313,8 @@ def reconstruct_glossy(
 ):
     """One thread owns a receiver and sends `ray_count` of its `rays_each` reconstruction rays, drawn by its BSDF.
 
-    Radiance in `tree` is what diffuse layers sent.
+    Radiance in `tree` is what diffuse layers sent. Where a ray meets a mirror it is reconstructed at the next segment
+    (section 4): mirrored there, in the tree of what lies beyond.
     """
     i = offset + wp.tid()
     j = receivers.sample[i]
@@ -267,54 +354,19 @@ def reconstruct_glossy(
             weight = b.weight
             if weight[0] + weight[1] + weight[2] <= 0.0:
                 continue
-        s = glossy_surface(tree, lobes.kappa, o, d, noise, keep_one, keep_two)
-        share = float(0.0)  # of the surface that is glossy
-        distance = float(0.0)
-        normal = n
-        splat = int(-1)
-        if s[6] > 0.0:
-            splat = nearest_facing(tree, o + s[6] * d, d)
-        light = wp.vec3(0.0)
-        if splat >= 0:
-            # what faces away belongs to the other side of something thin, whose light may be quite another
-            light = splat_radiance(tree, splat)
-            if lobes.kappa[splat] > 0.0:
-                share = 1.0
-                distance = s[6]
-                normal = splat_normal(tree, splat)
-        elif s[3] > 0.0:
-            light = wp.vec3(s[0], s[1], s[2]) / s[3]
-            if s[7] > 0.0:
-                share = s[7] / s[3]
-                distance = s[8] / s[7]
-                normal = wp.normalize(wp.vec3(s[9], s[10], s[11]))
-                splat = wp.cast(s[12], wp.int32)
-        elif sky.size > 0:
-            light = sky_radiance(sky, d)
-            counts[1] = counts[1] + 1
-        else:
-            counts[0] = counts[0] + 1
-        if share > 0.0:
-            if wp.dot(normal, d) > 0.0:
-                normal = -normal
-            lobe = largest_lobe(
-                lobes.tree,
-                lobes.axes,
-                lobes.cones,
-                o + distance * d,
-                normal,
-                d,
-                mirrored(d, normal),
-                distance,
-                lobes.stretch,
-            )
-            if lobe >= 0:
-                light = light + splat_radiance(lobes.tree, lobe) * share
+        first = look(tree, lobes, sky, beyond.mirror, o, d, noise, keep_one, keep_two)
+        light = first.light
+        counts = counts + first.counts
+        if first.mirror[0] + first.mirror[1] + first.mirror[2] > 0.0:
+            p = first.p - beyond.shift
+            way = mirrored(d, first.n)
+            second = look(beyond.tree, beyond.lobes, beyond.sky, beyond.none, p, way, beyond.noise, keep_one, keep_two)
+            if second.counts[0] > 0:
+                light = light + first.input
             else:
-                light = light + lobes.radiance[splat] * share
+                light = light + wp.cw_mul(first.mirror, second.light)
+            counts = counts + second.counts
         total = total + wp.cw_mul(weight, light)
-        counts[2] = counts[2] + int(s[4])
-        counts[3] = counts[3] + int(s[5])
     gathered.radiance[i] = total
     gathered.counts[i] = counts
 

@@ -3,7 +3,8 @@
 Where indirect light is gathered, an error at a surface's rim is one of many directions' in a sum; here it is the rim
 in the picture. So splats keep the size that their neighbours gave them, and a surface stops a ray only where the ray
 goes through the hull of its samples, as in Lehtinen et al. 2011, or close by one of them: within a part of the
-distance at which the nearest input ray passed it unhindered.
+distance at which the nearest input ray passed it unhindered. Samples three times that distance away or more are no
+part of the hull.
 """
 
 import warp as wp
@@ -31,13 +32,17 @@ COVERS = """        if (inside == 0 || (limit >= 1.0e30f && !open) || passed_cou
             bool covered = false;
             for (int j = 0; j < size; ++j) {
                 if (t_of[j] < limit) {
-                    const float bx = hx[j] - o[0], by = hy[j] - o[1], bz = hz[j] - o[2];
-                    ax[n] = bx * s[0] + by * s[1] + bz * s[2];
-                    ay[n] = bx * t[0] + by * t[1] + bz * t[2];
-                    ++n;
                     const int splat = place[j] >= 0 ? place[j] : -1 - place[j];
                     const float r2 = tree.blocks.data[(size_t)(splat / 8) * 80 + splat % 8 + 48];
-                    covered = covered | (e_of[j] * r2 <= part2 * free2.data[splat]);
+                    const float away2 = e_of[j] * r2;
+                    covered = covered | (away2 <= part2 * free2.data[splat]);
+                    // a hull of samples that input rays passed much nearer by would span gaps
+                    if (away2 <= 9.0f * free2.data[splat]) {
+                        const float bx = hx[j] - o[0], by = hy[j] - o[1], bz = hz[j] - o[2];
+                        ax[n] = bx * s[0] + by * s[1] + bz * s[2];
+                        ay[n] = bx * t[0] + by * t[1] + bz * t[2];
+                        ++n;
+                    }
                 }
             }
             if (!covered) {
@@ -56,6 +61,11 @@ COVERS = """        if (inside == 0 || (limit >= 1.0e30f && !open) || passed_cou
 """
 
 
+# Tents of one volume: a large splat, of few samples far apart, does not outweigh small ones of a denser surface by it.
+TENT = "const float w = 1.0f - wp::sqrt(e_of[j]);"
+TENT_OF_ONE_VOLUME = "const float w = (1.0f - wp::sqrt(e_of[j])) / larger(q[48], 1.0e-30f);"
+
+
 def _replaced(walk: str, *changes: tuple[str, str]) -> str:
     for old, new in changes:
         if walk.count(old) != 1:
@@ -67,6 +77,7 @@ def _replaced(walk: str, *changes: tuple[str, str]) -> str:
 LENS_SURFACE = _replaced(
     SURFACE,
     (TRUST_SIZES, COVERS),
+    (TENT, TENT_OF_ONE_VOLUME),
     ("int passed[16];", f"int passed[{MOST_PASSED}];"),
     ("1.0e-4f * (dx * dx + dy * dy + dz * dz)", "slope2 * smaller(dx * dx + dy * dy + dz * dz, 4.0f * p[48 + k])"),
 )

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warpgi.kernels.bsdf import COAT, is_delta, is_wide, sample
+from warpgi.kernels.bsdf import COAT, DELTA_EXPONENT, is_delta, is_wide, sample
 from warpgi.kernels.camera import Camera, shutter_time
 from warpgi.kernels.direct import add_features, direct_light, emitted, facing_normal, reflects
 from warpgi.kernels.film import Film, PathSample, add_sample
@@ -23,6 +23,7 @@ from warpgi.kernels.scene import (
     DIELECTRIC,
     DIFFUSE,
     FAR,
+    MIRROR,
     Hit,
     Scene,
     Surface,
@@ -70,6 +71,44 @@ class SampleArrays:
     layer: wp.array[int]  # that the secondary ray was drawn from, COAT or BASE
     bandwidth: wp.array[float]  # Blinn exponent at the secondary hit
     base_radiance: wp.array[wp.vec3]  # part of the radiance that left the secondary hit by way of a diffuse layer
+    # where the scene has mirrors too: the segment after one that the secondary ray met, with all light along it
+    mirror: wp.array[wp.vec3]  # what it reflects; 0 where none was met
+    beyond_hit: wp.array[wp.vec3]
+    beyond_normal: wp.array[wp.vec3]
+    beyond_radiance: wp.array[wp.vec3]
+    beyond_bandwidth: wp.array[float]
+    beyond_base: wp.array[wp.vec3]
+
+
+@wp.struct
+class MirrorMet:
+    found: int  # 1: a ray met a mirror first
+    p: wp.vec3
+    n: wp.vec3
+    reflectance: wp.vec3
+    distance: float
+    o: wp.vec3  # where the ray goes on
+    d: wp.vec3
+
+
+@wp.func
+def meet_mirror(scene: Scene, o: wp.vec3, d: wp.vec3):
+    """The mirror that a ray meets, if that is what it meets and it reflects all by itself."""
+    m = MirrorMet()
+    hit = closest_hit(scene, o, d)
+    if hit.face >= 0:
+        shape = scene.shapes[scene.face_shapes[hit.face]]
+        if shape.kind == MIRROR:
+            s = surface_at(scene, hit, shape)
+            m.n = facing_normal(s, -d)
+            m.d = d - m.n * (2.0 * wp.dot(d, m.n))
+            if reflects(s, -d, m.d) and wp.max(emitted(shape, s.ng, -d)) <= 0.0:
+                m.found = 1
+                m.p = s.p
+                m.reflectance = s.albedo
+                m.distance = hit.t
+                m.o = offset_origin(s.p, s.ng, s.offset, m.d)
+    return m
 
 
 @wp.func
@@ -99,6 +138,35 @@ def record_receiver(
     if scene.moving != 0:
         samples.time[place] = part
         samples.origin_motion[place] = motion_at(scene, hit) * camera.shutter_length
+
+
+@wp.func
+def record_beyond(samples: SampleArrays, k: int, mirror: MirrorMet, gathered: PathSample):
+    """The segment after a mirror, as a secondary ray's own would be; lamps at its end shine along it too."""
+    samples.mirror[k] = mirror.reflectance
+    samples.beyond_radiance[k] = gathered.emission + gathered.direct + gathered.indirect
+    samples.beyond_bandwidth[k] = gathered.bandwidth
+    samples.beyond_base[k] = gathered.base + gathered.emission
+    if gathered.depth >= 0.0:
+        samples.beyond_hit[k] = gathered.position
+        samples.beyond_normal[k] = gathered.normal
+    else:
+        samples.beyond_hit[k] = mirror.d * NO_HIT
+
+
+@wp.func
+def seen_in_mirror(mirror: MirrorMet, gathered: PathSample):
+    """What a path that met the mirror first has gathered."""
+    s = PathSample()
+    s.depth = mirror.distance
+    s.position = mirror.p
+    s.normal = mirror.n
+    s.bandwidth = DELTA_EXPONENT
+    s.direct = wp.cw_mul(mirror.reflectance, gathered.emission)
+    s.indirect = wp.cw_mul(mirror.reflectance, gathered.direct + gathered.indirect)
+    s.closest_hit_rays = gathered.closest_hit_rays
+    s.shadow_rays = gathered.shadow_rays
+    return s
 
 
 @wp.kernel
@@ -213,12 +281,28 @@ def trace_samples(
                 rest.max_depth = settings.max_depth - depth
                 if recorded and index >= samples.spp:
                     rest.max_depth = 1  # for the lamps that it meets alone
-                gathered = trace_path(
-                    scene, rest, sampler, CAMERA_PAIRS + VERTEX_PAIRS * depth, o, d, b.pdf * light_share
-                )
+                pair = CAMERA_PAIRS + VERTEX_PAIRS * depth
+                first_pdf = b.pdf * light_share
+                mirror = MirrorMet()
+                if samples.mirror.shape[0] > 0 and index < samples.spp and rest.max_depth > 1:
+                    mirror = meet_mirror(scene, o, d)
+                    path.closest_hit_rays = path.closest_hit_rays + 1
+                if mirror.found == 1:
+                    # the path goes on from there: what is met next sends its light along the next segment
+                    rest.max_depth = rest.max_depth - 1
+                    pair = pair + VERTEX_PAIRS
+                    first_pdf = 0.0
+                    o = mirror.o
+                    d = mirror.d
+                gathered = trace_path(scene, rest, sampler, pair, o, d, first_pdf)
                 path.has_ray = 1
-                if depth == 1 and gathered.depth >= 0.0:
+                if depth == 1 and mirror.found == 1:
+                    path.inverse_distance = inverse_distance(mirror.distance)
+                elif depth == 1 and gathered.depth >= 0.0:
                     path.inverse_distance = inverse_distance(gathered.depth)
+                if mirror.found == 1:
+                    record_beyond(samples, k, mirror, gathered)
+                    gathered = seen_in_mirror(mirror, gathered)
                 path.closest_hit_rays = path.closest_hit_rays + gathered.closest_hit_rays
                 path.shadow_rays = path.shadow_rays + gathered.shadow_rays
                 weight = wp.cw_mul(throughput, b.weight)

@@ -240,15 +240,18 @@ def shrink_crossed(
 
 # The first apparent surface along a ray, section 2.3.2: the gathered splats in front of the nearest conflict. A pair
 # conflicts where its event line meets the st plane in the positive, or in the negative, half-spaces of both (with the
-# authors' erratum); that is a b depth_i depth_j > 0 for a = (h_j - h_i).n_i and b = (h_j - h_i).n_j.
+# authors' erratum); that is a b depth_i depth_j > 0 for a = (h_j - h_i).n_i and b = (h_j - h_i).n_j. Of two that face
+# to opposite sides one normal is turned, or no back would hide what lies beyond it. They do not conflict where either
+# is nearer to the other's plane than the smaller radius, as the two sides of something thin are, nor where the back is
+# met in the outer half of its radius, which juts out over the edges of closed bodies.
 # `keep_one` and `keep_two` are squared parts of their radius that splats keep which are alone, or two, in the surface.
 # What follows finds `size` splats, of which those with t_of < limit, `inside` of them, are the surface.
 FIND_SURFACE = (
     WALK_HEAD
     + """
-    float hx[72], hy[72], hz[72], gx[72], gy[72], gz[72], depth[72], t_of[72], e_of[72];
+    float hx[72], hy[72], hz[72], gx[72], gy[72], gz[72], depth[72], side[72], t_of[72], e_of[72];
     for (int j = 0; j < 72; ++j)
-        hx[j] = hy[j] = hz[j] = gx[j] = gy[j] = gz[j] = depth[j] = 0.0f;
+        hx[j] = hy[j] = hz[j] = gx[j] = gy[j] = gz[j] = depth[j] = side[j] = e_of[j] = 0.0f;
     const float start = 0.0f, slack_noise2 = 16.0f * noise * noise;
     int place[64];
     int passed[16];
@@ -296,8 +299,8 @@ FIND_SURFACE = (
                         if (t_of[j] < limit) {
                             hx[kept] = hx[j]; hy[kept] = hy[j]; hz[kept] = hz[j];
                             gx[kept] = gx[j]; gy[kept] = gy[j]; gz[kept] = gz[j];
-                            depth[kept] = depth[j]; t_of[kept] = t_of[j]; e_of[kept] = e_of[j];
-                            place[kept] = place[j];
+                            depth[kept] = depth[j]; side[kept] = side[j]; t_of[kept] = t_of[j];
+                            e_of[kept] = e_of[j]; place[kept] = place[j];
                             farthest = t_of[kept] > t_of[farthest] ? kept : farthest;
                             ++kept;
                         }
@@ -311,13 +314,14 @@ FIND_SURFACE = (
                         --size;
                         hx[farthest] = hx[size]; hy[farthest] = hy[size]; hz[farthest] = hz[size];
                         gx[farthest] = gx[size]; gy[farthest] = gy[size]; gz[farthest] = gz[size];
-                        depth[farthest] = depth[size]; t_of[farthest] = t_of[size]; e_of[farthest] = e_of[size];
-                        place[farthest] = place[size];
+                        depth[farthest] = depth[size]; side[farthest] = side[size]; t_of[farthest] = t_of[size];
+                        e_of[farthest] = e_of[size]; place[farthest] = place[size];
                     }
                 }
                 const float px = p[k], py = p[8 + k], pz = p[16 + k];
                 const float nx = p[24 + k], ny = p[32 + k], nz = p[40 + k];
-                const float far = along[k];
+                const float far = along[k], e = e2[k] / p[48 + k];
+                const float turned = facing[k] < 0.0f ? p[48 + k] : -p[48 + k];
                 // eight at a time; lanes past the end hold old samples whose t is put beyond any limit
                 float first_conflict[8];
                 for (int c = 0; c < 8; ++c)
@@ -332,8 +336,12 @@ FIND_SURFACE = (
                         const float a = dx * gx[j + c] + dy * gy[j + c] + dz * gz[j + c];
                         const float b = dx * nx + dy * ny + dz * nz;
                         const float slack2 = 1.0e-4f * (dx * dx + dy * dy + dz * dz) + slack_noise2;
-                        const bool conflict =
-                            (a * b * (depth[j + c] * far) > 0.0f) & (a * a > slack2) & (b * b > slack2);
+                        const bool same_side = (side[j + c] > 0.0f) == (turned > 0.0f);
+                        const float thick2 = smaller(wp::abs(side[j + c]), wp::abs(turned));
+                        const float least2 = same_side ? slack2 : larger(slack2, thick2);
+                        const bool inner = same_side | ((turned > 0.0f ? e_of[j + c] : e) < 0.25f);
+                        const bool conflict = ((a * b * (depth[j + c] * far) > 0.0f) == same_side) & (a * a > least2) &
+                            (b * b > least2) & inner;
                         const float both = larger(t_of[j + c], t[k]);
                         first_conflict[c] = smaller(first_conflict[c], conflict ? both : 1.0e30f);
                     }
@@ -342,8 +350,8 @@ FIND_SURFACE = (
                     limit = smaller(limit, first_conflict[c]);
                 hx[size] = px; hy[size] = py; hz[size] = pz;
                 gx[size] = nx; gy[size] = ny; gz[size] = nz;
-                depth[size] = far; t_of[size] = t[k];
-                e_of[size] = e2[k] / p[48 + k];
+                depth[size] = far; side[size] = turned; t_of[size] = t[k];
+                e_of[size] = e;
                 place[size] = facing[k] < 0.0f ? splat : -1 - splat;
                 ++size;
             }

@@ -230,6 +230,10 @@ def test_refusals(kind):
     samples = plane()
     with pytest.raises(ValueError, match="memory_limit is 1000 bytes"):
         gi.reconstruct(samples, kind(), device=gi.Device("cpu", memory_limit=1000))
+    metal = gi.Shape([(-1, 0, -1), (-1, 0, 1), (1, 0, 1)], [(0, 1, 2)], gi.Conductor(0.05))
+    scene = gi.Scene([metal], gi.Camera((0, 1, 1), (0, 0, 0)), [gi.Environment((1, 1, 1))])
+    with pytest.raises(ValueError, match="glossy primary hits"):
+        gi.reconstruct(gi.sample(scene, 1, (8, 8), glossy=True), gi.ATrous())
     with pytest.raises(ValueError, match="spp is 0"):
         kind(spp=0)
     with pytest.raises(ValueError, match="never end"):

@@ -221,22 +221,107 @@ def room(floor, ceiling):
     return gi.Scene(shapes, camera, [gi.PointLight((0.3, 0.5, -0.2), (2.0, 1.5, 1.0))])
 
 
-@pytest.mark.parametrize(
-    ("ceiling", "bound"),
-    [(gi.Coated(0.5, 0.02), 0.02), (gi.Conductor(0.02), 0.02), (gi.Mirror(0.8), 0.1)],
-    ids=["coated", "metal", "mirror"],
-)
-def test_energy(ceiling, bound):
-    """Over a coated floor the picture's mean light is path tracing's to 2 %; under a mirror a tenth may be missing.
-
-    What a mirror shows changes from sample to sample, and is taken from the nearest by direction.
-    """
+@pytest.mark.parametrize("ceiling", [gi.Coated(0.5, 0.02), gi.Conductor(0.02), gi.Mirror(0.8)])
+def test_energy(ceiling):
+    """Over a coated floor the picture's mean light is path tracing's to 2 %, under a mirror too."""
     scene, size = room(gi.Coated(0.6, 0.05), ceiling), (24, 24)
     means = [gi.render(scene, gi.LightField(spp=8, rays=64), size, seed=s).layers["indirect"].mean() for s in range(8)]
     truth = [gi.render(scene, gi.PathTracing(spp=128), size, seed=100 + s).layers["indirect"].mean() for s in range(8)]
     error = np.sqrt((np.var(means, ddof=1) + np.var(truth, ddof=1)) / 8)
-    assert abs(np.mean(means) - np.mean(truth)) < bound * np.mean(truth) + 3.0 * error
+    assert abs(np.mean(means) - np.mean(truth)) < 0.02 * np.mean(truth) + 3.0 * error
     assert error < 0.025 * np.mean(truth)
+
+
+def test_a_spot_in_a_mirror_keeps_place_and_width():
+    """A spot on a wall below, seen in a mirror above by way of the floor: half a pixel of place, 5 % of width.
+
+    Without the segment after the mirror what is left is the mirror's own light, in the wrong place or wide.
+    """
+    rng = np.random.default_rng(4)
+    up = np.array([0.0, 0.0, 1.0])
+    pixel = np.arange(SIZE * SIZE * SPP) // SPP
+    origin = np.zeros((len(pixel), 3))
+    origin[:, :2] = 2.0 * (np.stack([pixel % SIZE, pixel // SIZE], axis=-1) + rng.random((len(pixel), 2))) / SIZE - 1.0
+    wo = unit(EYES[0] - origin).astype(np.float64)
+
+    def along(rays, start):
+        """Where rays meet the mirror at height 1, the wall at -1 behind it, and what comes from there."""
+        met = start + rays / rays[..., 2:]
+        wall = met + reflect(rays, up) / rays[..., 2:] * 2.0
+        away2 = np.square(wall[..., :2] - [0.1, 4.2]).sum(-1)
+        return met, wall, np.exp(-away2 / 0.18)[..., None] * np.array([1.0, 0.8, 0.6])
+
+    d, _ = blinn_rays(up, wo, FLOOR, rng.random((len(pixel), 2)))
+    met, wall, light = along(d, origin)
+
+    def rows(vector):
+        return np.broadcast_to(vector, origin.shape).astype(np.float32)
+
+    ends = {"origin": met, "hit": wall, "origin_normal": rows(-up), "hit_normal": rows(up), "radiance": light}
+    every = np.arange(len(pixel), dtype=np.int32)
+    ends = {name: value.astype(np.float32) for name, value in ends.items()}
+    beyond = SampleBuffer(len(pixel), 1, 0, pixel=every, albedo=rows(0.8), **ends)
+    samples = SampleBuffer(
+        SIZE,
+        SIZE,
+        SPP,
+        radiance=(0.8 * light).astype(np.float32),
+        origin=origin.astype(np.float32),
+        hit=met.astype(np.float32),
+        origin_normal=rows(up),
+        hit_normal=rows(-up),
+        albedo=rows(1.0),
+        bandwidth=np.full(len(pixel), 1e6, np.float32),
+        wo=wo.astype(np.float32),
+        material=np.zeros(len(pixel), np.int32),
+        reflectance=rows(FLOOR.reflectance),
+        materials=(FLOOR,),
+        beyond=beyond,
+    )
+    side = 24
+    strata = (np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 1, 2) + 0.5) / side
+    rays, weight = blinn_rays(up, wo[None, ::2], FLOOR, strata)
+    truth = (0.8 * along(rays, origin[None, ::2])[2] * weight).mean(axis=0)
+    truth = truth.reshape(SIZE, SIZE, SPP // 2, 3).mean(axis=2)
+    centre, width = shape_of(truth)
+    picture = gi.reconstruct(samples, gi.LightField(rays=256)).layers["indirect"]
+    found = shape_of(picture)
+    print(found, centre, width, picture.mean() / truth.mean())
+    assert np.abs(found[0] - centre).max() < 0.5
+    assert np.abs(found[1] / width - 1.0).max() < 0.05
+    assert picture.mean() == pytest.approx(truth.mean(), rel=0.02)
+    blurred = shape_of(gi.reconstruct(replace(samples, beyond=None), gi.LightField(rays=256)).layers["indirect"])
+    print(blurred)
+    assert np.abs(blurred[1] / width - 1.0).max() > 0.05 or np.abs(blurred[0] - centre).max() > 0.5
+
+
+def test_mirrors_are_walked_on_from():
+    """A floor under a mirror: light found at the next segment is nearer to the truth than light of the mirror itself.
+
+    Taken for the mirror's own, as if sent in all directions or in a narrow lobe, it is the light of the wrong place.
+    """
+    scene, size = room(gi.Diffuse(0.6), gi.Mirror(0.8)), (24, 24)
+    truth = np.mean(
+        [gi.render(scene, gi.PathTracing(spp=256), size, seed=100 + s).layers["indirect"] for s in range(2)], axis=0
+    )
+    method = gi.LightField(spp=8, rays=128)
+    samples = gi.sample(scene, 8, size, glossy=True)
+    assert samples.beyond is not None and samples.beyond.checked.is_splat.sum() > 100
+    # the segments join on: what the mirror reflects of one is what comes along the other
+    of = samples.beyond.pixel
+    np.testing.assert_allclose(samples.hit[of], samples.beyond.origin)
+    np.testing.assert_allclose(samples.radiance[of], 0.8 * samples.beyond.radiance, rtol=1e-5)
+    n, d = samples.unit_hit_normal[of], samples.direction[of]
+    seen = samples.beyond.checked.is_splat
+    np.testing.assert_allclose(samples.beyond.direction[seen], reflect(d, n)[seen], atol=1e-4)
+    errors = {}
+    for name, buffer in (
+        ("walked", samples),
+        ("lobe", replace(samples, beyond=None)),
+        ("diffuse", replace(samples, beyond=None, bandwidth=None)),
+    ):
+        errors[name] = gi.compare(gi.reconstruct(buffer, method).layers["indirect"], truth)["rmse"]
+    assert errors["walked"] < 0.6 * min(errors["lobe"], errors["diffuse"]), errors
 
 
 def test_same_bits_for_any_threads():
@@ -250,6 +335,38 @@ def test_same_bits_for_any_threads():
     collapsed = gi.reconstruct(replace(samples, base_radiance=None), gi.LightField(rays=64)).layers["indirect"]
     assert (collapsed != pictures[0]).any()
     assert collapsed.mean() == pytest.approx(pictures[0].mean(), rel=0.05)
+
+
+def test_layers_apart_are_nearer_to_the_truth():
+    """Light of a coat's diffuse base serves rays of all directions: a fifth less error at least than as one lobe."""
+    scene, size = room(gi.Diffuse(0.6), gi.Coated(0.5, 0.02)), (24, 24)
+    truth = gi.render(scene, gi.PathTracing(spp=512, max_depth=3), size, seed=100).layers["indirect"]
+    samples = gi.sample(scene, 4, size, glossy=True, max_depth=3)
+    errors = [
+        gi.compare(gi.reconstruct(buffer, gi.LightField(rays=128)).layers["indirect"], truth)["rmse"]
+        for buffer in (samples, replace(samples, base_radiance=None))
+    ]
+    assert errors[0] < 0.8 * errors[1], errors
+
+
+def test_memory_of_lobes():
+    """Diffuse samples cost what they did, 72 bytes on the host and 48 in the tree; a lobe 68 in a tree of its own.
+
+    That is ten floats, its number, and a 64th of a node with an eighth more for the levels above; and a lobe's axis,
+    kappa and cones likewise.
+    """
+    above = 8.0 / 7.0 / 64.0
+    splat = 4.0 * (10 + 1 + above * (48 + 1))
+    lobe = splat + 4.0 * (4 + above * 56)
+    box = gi.sample(gi.scenes.cornell_box(), spp=4, size=(64, 64), glossy=True)
+    state = gi.LightField().reconstruction(box, gi.Device("cpu"), 0)
+    assert box.bytes_per_sample == 72 and not isinstance(state, GlossyReconstruction)
+    assert state.tree.nbytes / state.tree.count == pytest.approx(splat, rel=0.02)
+    glossy = gi.sample(room(gi.Diffuse(0.6), gi.Conductor(0.02)), spp=4, size=(64, 64), glossy=True)
+    state = gi.LightField().reconstruction(glossy, gi.Device("cpu"), 0)
+    assert isinstance(state, GlossyReconstruction) and state.lobe_tree.count == state.tree.count
+    arrays = state.lobe_tree.axes.capacity + state.lobe_tree.cones.capacity
+    assert (state.lobe_tree.nbytes + arrays) / state.lobe_tree.count == pytest.approx(lobe, rel=0.02)
 
 
 def test_hair_is_never_brighter_than_its_input():

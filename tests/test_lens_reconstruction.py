@@ -15,7 +15,7 @@ from warpgi.temporal_reconstruction import TemporalReconstruction
 FACES = [(0, 1, 2), (0, 2, 3)]
 SQUARE = np.array([(-1.0, -1.0, 0.0), (1.0, -1.0, 0.0), (1.0, 1.0, 0.0), (-1.0, 1.0, 0.0)])
 METHODS = {
-    "light-field": gi.LightField(spp=1, rays=64, neighbours=8, primary_rays=True),
+    "light-field": gi.LightField(spp=1, rays=64, primary_rays=True),
     "temporal-light-field": gi.TemporalLightField(spp=1, rays=64),
 }
 SIZE = (48, 32)
@@ -69,7 +69,7 @@ def reconstruct(samples, kind, rays=8):
     if kind == "temporal":
         state = TemporalReconstruction(samples, device, 3, 1.8)
     else:
-        state = LensReconstruction(samples, device, Preprocessing(8, 3.0, 1e-3, 1.0), 3)
+        state = LensReconstruction(samples, device, Preprocessing(12, 3.0, 1e-3, 1.0), 3)
     state.gather(0, rays, rays)
     return state.image()
 

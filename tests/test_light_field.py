@@ -337,13 +337,13 @@ def test_one_sample_per_pixel(blocks):
 def test_it_never_sees_the_scene():
     """With the scene gone, the buffer alone gives `gi.render`'s indirect layer, but for how a pixel's sum rounds."""
     scene, _ = gi.scenes.furnace(albedo=0.5, shape="blocks")  # about the origin: positions are not moved
-    rendered = gi.render(scene, light_field(), size=(12, 12), seed=3).layers["indirect"]
+    rendered = gi.render(scene, light_field(primary_hits=4), size=(12, 12), seed=3).layers["indirect"]
     samples = gi.sample(scene, spp=4, size=(12, 12), seed=3)
     del scene
     np.testing.assert_allclose(indirect(samples, seed=3), rendered, rtol=1e-6)
     # where the scene has its centre elsewhere, world coordinates round
     scene = gi.scenes.cornell_box()
-    rendered = gi.render(scene, light_field(), size=(16, 16)).layers["indirect"]
+    rendered = gi.render(scene, light_field(primary_hits=4), size=(16, 16)).layers["indirect"]
     samples = gi.sample(scene, spp=4, size=(16, 16))
     del scene
     assert np.isclose(indirect(samples), rendered, rtol=1e-3, atol=1e-6).mean() > 0.9

@@ -198,7 +198,7 @@ def test_tolerance_zero_is_the_per_pixel_reconstruction():
     scene, size = gi.scenes.cornell_box(), (14, 14)
     method = gi.MeshlessHierarchy(spp=2, rays=32, tolerance=0.0, levels=16, light_samples=2)
     ours = gi.render(scene, method, size=size)
-    theirs = gi.render(scene, gi.LightField(spp=2, rays=64, light_samples=2), size=size)
+    theirs = gi.render(scene, gi.LightField(spp=2, rays=64, primary_hits=2, light_samples=2), size=size)
     np.testing.assert_allclose(ours.layers["indirect"], theirs.layers["indirect"], atol=1e-4, rtol=1e-3)
 
 

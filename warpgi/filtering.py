@@ -15,6 +15,7 @@ from warpgi import checks
 from warpgi.device import Device
 from warpgi.film import Film
 from warpgi.job import Job
+from warpgi.materials import Diffuse
 from warpgi.methods.path import NEVER, Sampler, check_paths
 from warpgi.reconstruction import PrimaryHits, pixel_means
 from warpgi.samples import NO_HIT, SampleBuffer
@@ -383,6 +384,11 @@ def _faults(samples: SampleBuffer) -> dict[str, int]:
 def _check_secondary(samples: SampleBuffer) -> None:
     if not samples.has_secondary_rays:
         raise ValueError("samples hold no secondary rays, expected a sample buffer of format 2.0 or newer")
+    if samples.material is not None:
+        glossy = [number for number, material in enumerate(samples.materials) if not isinstance(material, Diffuse)]
+        if np.isin(samples.material[samples.checked.is_primary], glossy).any():
+            # their light would be multiplied by the albedo in place of the BSDF
+            raise ValueError("samples hold glossy primary hits, expected only diffuse ones: those of glossy=False")
 
 
 def _positions(layers: Mapping[str, np.ndarray]) -> np.ndarray:

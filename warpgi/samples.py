@@ -148,6 +148,10 @@ class SampleBuffer:
     `bandwidth`."""
     materials: tuple[Any, ...] = ()
     """What `material` counts."""
+    beyond: SampleBuffer | None = None
+    """The path's next segments where secondary rays met mirrors: from there (`origin`, `origin_normal`) to what is
+    seen in the mirror, with all light along them; `albedo` is what the mirror reflects, `pixel` the sample's number
+    here, in a picture of one row. Files do not hold it."""
     coc: tuple[float, float] = (0.0, 0.0)
     """C0, C1: the circle of confusion at depth z has the radius C0/z + C1 [pixels]."""
     pixel_to_camera: np.ndarray = field(default_factory=lambda: np.eye(4))
@@ -177,6 +181,8 @@ class SampleBuffer:
         for name in UNFILED_INTEGERS:
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, _array(name, getattr(self, name), (count,), np.int32, reason))
+        if self.beyond is not None and (self.beyond.pixel is None or self.beyond.width != count):
+            raise ValueError(f"beyond lacks pixel or is not {count} pixels wide, expected the samples' numbers there")
         object.__setattr__(self, "coc", tuple(checks.finite_array("coc", self.coc, (2,)).tolist()))
         matrix = checks.finite_array("pixel_to_camera", self.pixel_to_camera, (4, 4))
         object.__setattr__(self, "pixel_to_camera", matrix)

@@ -30,6 +30,15 @@ GLOSS = (
     {"material": int, "wo": wp.vec3, "reflectance": wp.vec3},
     {"layer": int, "bandwidth": float, "base_radiance": wp.vec3},
 )
+# Beside these where the scene has mirrors: the segment after one, beginning at the secondary hit.
+BEYOND: dict[str, Any] = {
+    "mirror": wp.vec3,
+    "beyond_hit": wp.vec3,
+    "beyond_normal": wp.vec3,
+    "beyond_radiance": wp.vec3,
+    "beyond_bandwidth": float,
+    "beyond_base": wp.vec3,
+}
 PLACE = {"face": int, "bary": wp.vec2}  # of a primary hit on its surface
 ANY_EXPONENT = 1e30
 #: Device bytes of a primary hit, and of a secondary ray beside it.
@@ -75,6 +84,9 @@ def trace_sample_buffer(
             of_hits, of_rays = of_hits | more_of_hits, of_rays | more_of_rays
     if scene.camera.lens_radius > 0.0:
         of_hits["lens"] = wp.vec2
+    with_mirrors = with_gloss and scene.has_mirrors and not scene.moves
+    if with_mirrors:
+        of_rays |= BEYOND
     paths = path_settings(job, max_depth, roulette_depth, sampler, with_gloss)
     arrays = _trace(job, film, hits, spp, light_samples, paths, of_hits, of_rays)
     # on cpu these are the very arrays, which the buffer keeps alive
@@ -87,7 +99,21 @@ def trace_sample_buffer(
             values[name] = np.ascontiguousarray(of_pixel[:, :spp]).reshape(-1, *values[name].shape[1:])
     if with_gloss:
         values["materials"] = tuple(shape.material for shape in scene.shapes)
+    if with_mirrors:
+        values["beyond"] = _beyond(values)
     return SampleBuffer(job.size[0], job.size[1], spp, **values, **_projection(job)), every
+
+
+def _beyond(values: dict[str, Any]) -> SampleBuffer | None:
+    """The segments after mirrors, taken out of the arrays of secondary rays; None where no ray met any."""
+    arrays = {name: values.pop(name) for name in BEYOND}
+    met = np.flatnonzero(arrays["mirror"].any(axis=1)).astype(np.int32)
+    if not len(met):
+        return None
+    names = ("hit", "hit_normal", "radiance", "bandwidth", "base_radiance")
+    after = dict(zip(names, (arrays[name][met] for name in list(BEYOND)[1:]), strict=True))
+    start = {"origin": values["hit"][met], "origin_normal": values["hit_normal"][met], "albedo": arrays["mirror"][met]}
+    return SampleBuffer(len(arrays["mirror"]), 1, 0, pixel=met, **after, **start)
 
 
 def trace_primary_hits(
@@ -240,7 +266,8 @@ def sample(
         job, film, spp, spp, 1, depth, 5, Sampler.SOBOL, recursive, glossy and scene.is_glossy
     )
     centre = on_device.centre.astype(np.float32)
-    for points in (samples.origin, samples.hit):
+    beyond = samples if samples.beyond is None else samples.beyond
+    for points in {id(points): points for points in (samples.origin, samples.hit, beyond.origin, beyond.hit)}.values():
         met = np.abs(points).max(axis=1) < NO_HIT
         points[met] += centre
     return samples

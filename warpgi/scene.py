@@ -177,8 +177,13 @@ class Scene:
 
     @property
     def is_glossy(self) -> bool:
-        """Whether any shape has a glossy lobe of some width."""
-        return any(isinstance(shape.material, (Conductor, Coated)) for shape in self.shapes)
+        """Whether any shape has a glossy lobe of some width, or is a mirror."""
+        return any(isinstance(shape.material, (Conductor, Coated, Mirror)) for shape in self.shapes)
+
+    @property
+    def has_mirrors(self) -> bool:
+        """Whether any shape is a mirror."""
+        return any(isinstance(shape.material, Mirror) for shape in self.shapes)
 
     def bounds(self) -> np.ndarray:
         """Smallest and largest vertex coordinates at any time, shape (2, 3), float64."""

@@ -1,4 +1,4 @@
-"""Where light-field reconstruction fails: walls thinner than splats, foliage, single samples, and gloss."""
+"""Where light-field reconstruction fails: thin walls, foliage, single samples, gloss, mirrors, hair and motion."""
 
 from __future__ import annotations
 
@@ -79,6 +79,70 @@ def gloss_blur(device: gi.Device) -> Value:
     return mean_value([float(np.sqrt(np.square(error).mean())) for error in errors])
 
 
+def _under(ceiling: gi.Mirror) -> gi.Scene:
+    """A coated floor seen from the side, lit from close by, under a wide ceiling."""
+
+    def flat(
+        material: gi.Coated | gi.Mirror, height: float, size: float, faces: list[tuple[int, int, int]]
+    ) -> gi.Shape:
+        corners = [(-size, height, -size), (-size, height, size), (size, height, size), (size, height, -size)]
+        return gi.Shape(corners, faces, material)
+
+    shapes = [flat(gi.Coated(0.6, 0.05), 0, 1, [(0, 1, 2), (0, 2, 3)]), flat(ceiling, 1, 4, [(0, 2, 1), (0, 3, 2)])]
+    camera = gi.Camera((0.0, 0.6, 1.6), (0.0, 0.0, 0.0), fov=40)
+    return gi.Scene(shapes, camera, [gi.PointLight((0.3, 0.5, -0.2), (2.0, 1.5, 1.0))], name="mirror-ceiling")
+
+
+def mirror_energy(device: gi.Device) -> Value:
+    """How far mean light of a floor under a mirror is from path tracing's, as a share of it."""
+    scene, size = _under(gi.Mirror(0.8)), (48, 48)
+    mean = make_reference(scene, size, 256, device=device).image.mean(dtype=np.float64)
+    method = gi.LightField(spp=8, rays=64)
+    found = mean_value([indirect(scene, method, size, seed, device).mean() for seed in range(4)])
+    return Value(abs(found.value / mean - 1.0), (found.error or 0.0) / mean)
+
+
+def hair_excess(device: gi.Device) -> Value:
+    """Brightest pixel's mean incident light over the brightest input sample's, of thin glossy strands: at most 1."""
+    rng = np.random.default_rng(7)
+    count = 400
+    root = np.concatenate([rng.uniform(-1.0, 1.0, (count, 2)), np.zeros((count, 1))], axis=1)
+    tip = root + np.array([0.0, 0.0, 0.8]) + rng.normal(0.0, 0.15, (count, 3))
+    side = 0.004 * np.cross(tip - root, rng.normal(size=(count, 3)))
+    vertices = np.concatenate([root - side, root + side, tip])
+    faces = np.arange(count)[:, None] + count * np.arange(3)
+    floor = [(-1.2, -1.2, 0.0), (1.2, -1.2, 0.0), (1.2, 1.2, 0.0), (-1.2, 1.2, 0.0)]
+    shapes = [gi.Shape(vertices, faces, gi.Conductor(0.05)), gi.Shape(floor, [(0, 1, 2), (0, 2, 3)], gi.Diffuse(0.5))]
+    scene = gi.Scene(
+        shapes, gi.Camera((0, -2.5, 1.5), (0, 0, 0.3), fov=45), [gi.DistantLight((0.3, 0.4, -1), (3, 3, 3))]
+    )
+    found = []
+    for seed in range(4):
+        samples = gi.sample(scene, 4, (32, 24), seed, device, glossy=True)
+        method = gi.LightField(rays=64)
+        state = method.reconstruction(samples, device, seed)
+        state.gather(0, 16, 16)
+        diffuse = samples.material == 1
+        found.append(float(state.incident()[diffuse].max() / samples.radiance.max()))  # type: ignore[union-attr]
+    return mean_value(found)
+
+
+def disoccluded(device: gi.Device) -> Value:
+    """Share of rays without support where things move; pixels that hold no other keep their input."""
+    method = gi.LightField(spp=1, rays=32, primary_rays=True)
+    counts = [gi.render(gi.scenes.butterflies(), method, (96, 54), seed, device).counts for seed in range(4)]
+    return mean_value([c["missing_support"] / c["reconstruction_rays"] for c in counts])
+
+
+def lens_energy(device: gi.Device) -> Value:
+    """How far mean light through a lens is from path tracing's, as a share of it."""
+    scene, size = gi.scenes.butterflies(), (96, 54)
+    truth = gi.render(scene, gi.PathTracing(spp=256), size, 1 << 30, device).image.mean(dtype=np.float64)
+    method = gi.LightField(spp=1, rays=32, primary_rays=True)
+    found = mean_value([float(gi.render(scene, method, size, seed, device).image.mean()) for seed in range(4)])
+    return Value(abs(found.value / truth - 1.0), (found.error or 0.0) / truth)
+
+
 def _row(scene: str, what: str, bound: float | None, measure) -> Failure:
     return Failure("light-field", scene, what, bound, measure)
 
@@ -91,4 +155,8 @@ ROWS = (
     _row("furnace, blocks", "rays that meet no splat, share, 1 spp", 0.01, unsupported),
     _row("caustic, rough ring", "mean light beside path tracing's, relative, 8 spp", None, gloss_energy),
     _row("caustic, rough ring", "RMS error inside the ring over the truth's spread, 8 spp", None, gloss_blur),
+    _row("floor under a mirror", "mean light beside path tracing's, relative, 8 spp", 0.02, mirror_energy),
+    _row("glossy strands", "brightest incident light over the brightest input sample's, 4 spp", 1.0, hair_excess),
+    _row("butterflies", "rays through lens and shutter without support, share, 1 spp", 0.001, disoccluded),
+    _row("butterflies", "mean light beside path tracing's, relative, 1 spp", 0.02, lens_energy),
 )

@@ -41,6 +41,10 @@ from warpgi.sampling import PRIMARY_BYTES, SECONDARY_BYTES, path_settings, trace
 from warpgi.traced_reconstruction import KERNELS as TRACED_KERNELS
 from warpgi.traced_reconstruction import TracedReconstruction
 
+# Points of a pixel that make its edges, textures and foliage smooth, while this many rays are left to each.
+SMOOTH_HITS = 16
+FEWEST_RAYS = 8
+
 AnyReconstruction = Reconstruction | CachedReconstruction | LensReconstruction
 
 
@@ -48,7 +52,8 @@ AnyReconstruction = Reconstruction | CachedReconstruction | LensReconstruction
 class LightField:
     """Indirect light reconstructed from a few path-traced samples per pixel (Lehtinen et al. 2012).
 
-    Reconstructs what diffuse and glossy surfaces reflect; mirrors and glass keep their path-traced light.
+    Reconstructs what diffuse and glossy surfaces reflect; mirrors and glass keep their path-traced light. Where
+    secondary rays meet mirrors, light is reconstructed at the next segment of the path.
     `gi.reconstruct` uses it on a sample buffer alone, where the fields that say how samples are traced mean nothing.
 
     Raises:
@@ -77,8 +82,8 @@ class LightField:
     recursive_rays: int = 16
     """Reconstruction rays for each sample in that step."""
     primary_hits: int | None = None
-    """Primary hits per pixel at which light is gathered, `spp` or more; None is `spp`. More of them make smooth edges,
-    textures and foliage, for the cost of a camera ray each."""
+    """Primary hits per pixel at which light is gathered, `spp` or more. More of them make smooth edges, textures and
+    foliage, for the cost of a camera ray each; None is up to 16, of at least 8 rays each."""
     photons: int = 0
     """Paths from the lights for a photon map that gives the radiance at secondary hits in place of traced paths: free
     of noise but blurred, with caustics read at the primary hits; 0: none."""
@@ -105,7 +110,7 @@ class LightField:
     primary_rays: bool = False
     """Reconstruct what the lens sees while the shutter is open from camera rays, not what surfaces reflect from
     secondary rays (section 3.4); the whole picture, in the layer "image", and the way to render what moves. `rays` are
-    then those of a pixel; settings that say how indirect light is gathered mean nothing. 8 neighbours do well."""
+    then those of a pixel; settings that say how indirect light is gathered mean nothing."""
 
     def __post_init__(self) -> None:
         checks.count("spp", self.spp)
@@ -160,7 +165,7 @@ class LightField:
     @property
     def hits(self) -> int:
         """Primary hits per pixel."""
-        return self.primary_hits or self.spp
+        return self.primary_hits or max(self.spp, min(SMOOTH_HITS, self.rays // FEWEST_RAYS))
 
     def passes(self, hits: int | None = None) -> tuple[int, str]:
         """Reconstruction rays for each primary hit, at `hits` of them in a pixel, and what to call them."""
