@@ -2,7 +2,15 @@
 
 import warp as wp
 
-from warpgi.kernels.bsdf import base_entry, base_reflectance, base_share, has_base, is_delta, sample
+from warpgi.kernels.bsdf import (
+    base_entry,
+    base_reflectance,
+    base_share,
+    fresnel_dielectric,
+    has_base,
+    is_delta,
+    sample,
+)
 from warpgi.kernels.bvh import BLOCK_STRIDE, LANES, RADIUS_ROW
 from warpgi.kernels.camera import Camera
 from warpgi.kernels.density import GUESS_NEARBY, Density, Lookup, density, nearest_photons, nearest_place, vec8
@@ -307,9 +315,31 @@ def visible_light(scene: Scene, o: wp.vec3, d: wp.vec3, pdf: float):
     return emitted(shape, ng, -d) * emission_weight(shape, ng, d, hit.t, pdf)
 
 
+@wp.struct
+class Followed:
+    """A camera path."""
+
+    path: PathSample
+    forked: int  # 1: it met glass first, and followed but one of what it reflects and what is seen through it
+
+
 @wp.func
-def follow(scene: Scene, maps: Maps, view: View, pixel: int, index: int, sampler: Sampler, o_: wp.vec3, d_: wp.vec3):
-    """One camera path: over mirrors, glass and metal to a diffuse surface, where light is sampled and maps are read."""
+def follow(
+    scene: Scene,
+    maps: Maps,
+    view: View,
+    pixel: int,
+    index: int,
+    sampler: Sampler,
+    o_: wp.vec3,
+    d_: wp.vec3,
+    through: int,
+):
+    """One camera path: over mirrors, glass and metal to a diffuse surface, where light is sampled and maps are read.
+
+    Of glass that it meets first it follows the reflection, or with `through` 1 what is transmitted, by its share of the
+    light: drawn by that share a lamp's reflection would be rare bright dots.
+    """
     o = o_
     d = d_
     path = PathSample()
@@ -318,6 +348,7 @@ def follow(scene: Scene, maps: Maps, view: View, pixel: int, index: int, sampler
     bsdf_pdf = float(0.0)
     coat = wp.vec3(1.0)  # part of the reflection at the last surface that is not its diffuse layer's
     depth = int(1)
+    forked = int(0)
     while True:
         hit = closest_hit(scene, o, d)
         path.closest_hit_rays = path.closest_hit_rays + 1
@@ -402,7 +433,14 @@ def follow(scene: Scene, maps: Maps, view: View, pixel: int, index: int, sampler
             path = add_light(path, depth + 1, wp.cw_mul(throughput, light.radiance))
 
         # on, by what is not diffuse
-        b = sample(shape, s.albedo, n, wo, sample_2d(sampler, pair + 1))
+        drawn = sample_2d(sampler, pair + 1)
+        if depth == 1 and shape.kind == DIELECTRIC:
+            forked = 1
+            cos_o = wp.dot(n, wo)
+            reflected = fresnel_dielectric(wp.abs(cos_o), wp.where(cos_o >= 0.0, shape.ior, 1.0 / shape.ior))
+            drawn = wp.vec2(float(through), drawn[1])
+            throughput = throughput * wp.where(through == 1, 1.0 - reflected, reflected)
+        b = sample(shape, s.albedo, n, wo, drawn)
         if wp.max(b.weight) <= 0.0 or (b.transmitted == 0 and not reflects(s, wo, b.wi)):
             break
         throughput = wp.cw_mul(throughput, b.weight)
@@ -411,7 +449,10 @@ def follow(scene: Scene, maps: Maps, view: View, pixel: int, index: int, sampler
         o = offset_origin(s.p, s.ng, s.offset, b.wi)
         d = b.wi
         depth = depth + 1
-    return path
+    result = Followed()
+    result.path = path
+    result.forked = forked
+    return result
 
 
 @wp.kernel
@@ -424,4 +465,12 @@ def see(
     for index in range(first_sample, first_sample + sample_count):
         sampler = make_sampler(view.seed, pixel, index, view.sampler)
         ray = pixel_ray(camera, sampler, pixel)
-        add_sample(film, i, follow(scene, maps, view, pixel, index, sampler, ray.o, ray.d))
+        followed = follow(scene, maps, view, pixel, index, sampler, ray.o, ray.d, 0)
+        path = followed.path
+        if followed.forked == 1:
+            other = follow(scene, maps, view, pixel, index, sampler, ray.o, ray.d, 1).path
+            path.direct = path.direct + other.direct
+            path.indirect = path.indirect + other.indirect
+            path.closest_hit_rays = path.closest_hit_rays + other.closest_hit_rays
+            path.shadow_rays = path.shadow_rays + other.shadow_rays
+        add_sample(film, i, path)

@@ -177,6 +177,26 @@ def test_pictures_agree_with_path_tracing():
             assert b.mean() == pytest.approx(a.mean(), rel=0.02)
 
 
+@pytest.mark.parametrize("gather", [0, 2])
+def test_glass_that_is_seen_shows_both_its_lobes(gather):
+    """One camera path shows a lamp that glass reflects at its 4 %, and what is behind the glass at the rest, without
+    the noise of a choice between the two."""
+    corners, faces = np.float64([(-9, 0, -9), (9, 0, -9), (9, 0, 9), (-9, 0, 9)]), [(0, 2, 1), (0, 3, 2)]
+    down = [face[::-1] for face in faces]
+    above, below = (0, 3, 0), (0, -1, 0)
+    glass = gi.Shape(corners, faces, gi.Dielectric(1.5))
+    lamp = gi.Shape(corners + above, down, gi.Diffuse(0.0), gi.Emissive(2.0))
+    glow = gi.Shape(corners + below, faces, gi.Diffuse(0.0), gi.Emissive(1.0))
+    camera = gi.Camera((0, 1, 0), (0, 0, 0), up=(0, 0, 1), fov=2.0)
+    method = gi.PhotonMap(spp=1, photons=100, caustic_photons=100, final_gather=gather)
+    # at normal incidence; of light that is refracted radiance falls by the square of the index, as there is no way out
+    reflected = ((1.5 - 1.0) / (1.5 + 1.0)) ** 2
+    for shapes, light in (([glass, lamp], 2.0 * reflected), ([glass, glow], (1.0 - reflected) / 1.5**2)):
+        image = gi.render(gi.Scene(shapes, camera), method, (8, 8), device="cpu").image
+        # directions within 1.5 degrees of the normal
+        np.testing.assert_allclose(image, light, rtol=1e-3)
+
+
 def test_gather_rays_make_no_dots_of_caustics():
     """Light of caustics elsewhere is neither lost nor counted twice, and no pixel of the ceiling, which looks down on a
     caustic, is far from its neighbours."""
