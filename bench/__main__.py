@@ -7,7 +7,7 @@ from pathlib import Path
 
 import tyro
 
-from bench import animations, cache_figure, chart, figures, rays, reconstruction, stability
+from bench import animations, cache_figure, chart, figures, point_animations, rays, reconstruction, stability
 
 BROKEN = 1  # exit status for a method that is worse than its bound
 MISUSE = 2  # exit status for a caller's mistake
@@ -135,6 +135,29 @@ def animation_command(
     animations.run(animations.Contest(scene, size, spp, frames, pairs, reference_spp, device), json, picture)
 
 
+def points_command(
+    out: Path,
+    scene: str = "moving-car",
+    size: tuple[int, int] = (128, 72),
+    frames: int = 42,
+    frame: int = 20,
+    reference_spp: int = 512,
+    device: str | None = None,
+) -> None:
+    """Picture of a frame whose light was filtered at points of surfaces, between its noisy input and its reference.
+
+    Args:
+        out: PNG to write.
+        scene: Built-in sequence.
+        size: Width and height in pixels of each part.
+        frames: How many frames the sequence has.
+        frame: Which of them is shown.
+        reference_spp: Paths per pixel of the reference.
+        device: cpu, cuda, cuda:0, ...; a GPU if there is one.
+    """
+    point_animations.draw(out, scene, size, frames, frame, reference_spp, device)
+
+
 def chart_command(
     scene: tuple[str, ...] = ("cornell-box", "courtyard"),
     size: tuple[int, int] = (256, 256),
@@ -198,6 +221,7 @@ def main(arguments: list[str] | None = None) -> int:
     app.command(scaling_command, name="scaling")
     app.command(cache_command, name="cache")
     app.command(animation_command, name="animation")
+    app.command(points_command, name="points")
     app.command(chart_command, name="chart")
     app.command(stability_command, name="stability")
     try:

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import warpgi as gi
+from bench.figures import GAP, WHITE
+from bench.reference import make_reference
+from warpgi import checks
 from warpgi.device_scene import DeviceScene
+from warpgi.image import check_output, write_png
 from warpgi.point_animation import PointRun
 from warpgi.poisson_disc import poisson_disc
 from warpgi.surface_points import SurfacePoints
@@ -16,6 +21,27 @@ from warpgi.surface_points import SurfacePoints
 # Random places on a shape to each of the discs that would cover it, so that few are missed.
 PLACES_PER_DISC = 30
 MOST_PLACES = 1 << 18
+
+
+def draw(
+    out: Path, scene: str, size: tuple[int, int], frames: int, frame: int, reference_spp: int, device: str | None
+) -> None:
+    """A frame's indirect light by 16 paths per pixel, by filtered points, and path-traced, side by side."""
+    check_output(out)
+    checks.image_size(size)
+    checks.count("reference_spp", reference_spp, 2)
+    sequence, where = gi.scenes.build_sequence(scene, frames=frames), gi.Device(device)
+    reference = make_reference(sequence.scene(frame), size, reference_spp, device=where)
+    noisy = gi.render(sequence.scene(frame), gi.PathTracing(spp=16), size, 0, where)
+    points = gi.render_animation(sequence, gi.PointFilter(), size, 0, where)
+    print(describe(sequence, gi.PointFilter(), size, where))
+    pictures = [render.layers["indirect"] for render in (noisy, points[frame])]
+    for picture, name in zip(pictures, ("path, 16 spp", "points"), strict=True):
+        print(f"{name}: relmse {reference.judge(picture)['relmse']:.3g}")
+    gap = np.full((size[1], GAP, 3), WHITE, np.float32)
+    row = [part for picture in (*pictures, reference.image) for part in (picture, gap)][:-1]
+    write_png(out, np.concatenate(row, axis=1).astype(np.float32), 2.0)
+    print(f"wrote {out}")
 
 
 def filtered_points(judge: Any, sequence: gi.Sequence, contest: Any, device: gi.Device) -> list[Any]:

@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from warpgi.kernels.bsdf import sample
+from warpgi.kernels.glossy_light_field import Surfaces
 from warpgi.kernels.hemisphere import Hemispheres, stratum_direction
 from warpgi.kernels.lanes import POINT_WALK
 from warpgi.kernels.light_field import GATHER_PAIR, Gathered, Incident, Receivers
@@ -9,7 +11,7 @@ from warpgi.kernels.path import PathSettings
 from warpgi.kernels.path_strata import incident_light
 from warpgi.kernels.rng import SOBOL, make_sampler, sample_2d
 from warpgi.kernels.sampling import make_frame, square_to_cosine_hemisphere, to_world
-from warpgi.kernels.scene import FAR, Scene, closest_hit, offset_origin
+from warpgi.kernels.scene import DIFFUSE, FAR, Scene, closest_hit, offset_origin
 from warpgi.kernels.splats import SplatTree
 
 wp.set_module_options({"enable_backward": False})
@@ -124,6 +126,7 @@ def gather_traced(
     offset: int,
     scene: Scene,
     light: Light,
+    surfaces: Surfaces,
     receivers: Receivers,
     rays_each: int,
     first_ray: int,
@@ -131,7 +134,7 @@ def gather_traced(
     seed: int,
     gathered: Gathered,
 ):
-    """One thread owns a receiver and sends `ray_count` of its `rays_each` cosine-distributed rays."""
+    """One thread owns a receiver and sends `ray_count` of its `rays_each` rays, drawn by its BSDF."""
     i = offset + wp.tid()
     j = receivers.sample[i]
     n = receivers.normals[j]
@@ -143,9 +146,19 @@ def gather_traced(
         # one sequence a pixel, cut into the shares of its samples
         number = (j % receivers.spp) * rays_each + ray
         sampler = make_sampler(seed, pixel, number, SOBOL)
-        d = to_world(frame, square_to_cosine_hemisphere(sample_2d(sampler, GATHER_PAIR)))
+        u = sample_2d(sampler, GATHER_PAIR)
+        d = to_world(frame, square_to_cosine_hemisphere(u))
+        weight = wp.vec3(1.0)
+        if surfaces.material.shape[0] > 0:
+            shape = surfaces.records[surfaces.material[j]]
+            if shape.kind != DIFFUSE:
+                b = sample(shape, surfaces.reflectance[j], n, surfaces.wo[j], u)
+                d = b.wi
+                weight = b.weight
+        if wp.max(weight) <= 0.0:
+            continue
         found = traced(scene, light, receivers.origins[j], n, d, pixel, number)
-        total = total + found.radiance
+        total = total + wp.cw_mul(weight, found.radiance)
         counts = counts + found.counts
     gathered.radiance[i] = total
     gathered.counts[i] = counts

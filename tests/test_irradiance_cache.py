@@ -191,6 +191,30 @@ def test_mirrors_and_metal_are_not_cached():
     assert renders[0].counts["hits"] < 2 * 24 * 18
 
 
+def test_metal_is_gathered_hit_by_hit():
+    """A block of rough metal in the box has no record and no filter; its light is path tracing's, within 4 % and noise,
+    and what is diffuse beside it is cached as ever. A sample buffer of it needs no scene."""
+    box = gi.scenes.cornell_box()
+    block = dataclasses.replace(box.shapes[-1], material=gi.Conductor(0.2, (0.9, 0.8, 0.6)))
+    scene = gi.Scene([*box.shapes[:-1], block], box.camera, box.lights, name="metal block")
+    size, method = (24, 24), gi.LightField(spp=1, primary_hits=4, rays=64, record_rays=64, cache=True)
+    truth = [gi.render(scene, gi.PathTracing(spp=64), size, seed) for seed in range(8)]
+    ours = [gi.render(scene, method, size, seed) for seed in range(8)]
+    assert 0 < ours[0].counts["glossy_hits"] < 0.3 * 4 * 24 * 24
+    assert ours[0].counts["records"] > 20
+    shows = gi.render(box, gi.PathTracing(spp=4), size).layers["albedo"]
+    metal = np.abs(truth[0].layers["albedo"] - shows).max(axis=2) > 0.1
+    assert metal.sum() > 20
+    for where in (metal, ~metal):
+        a, b = (np.array([r.layers["indirect"][where].mean(dtype=np.float64) for r in them]) for them in (ours, truth))
+        error = np.hypot(a.std(ddof=1), b.std(ddof=1)) / np.sqrt(8)
+        assert abs(a.mean() - b.mean()) < 0.04 * b.mean() + 4.4 * error, (a.mean(), b.mean(), error)
+    samples = gi.sample(scene, spp=1, size=size, glossy=True)
+    alone = gi.reconstruct(samples, gi.LightField(rays=16, record_rays=64, cache=True))
+    assert alone.counts["glossy_hits"] > 0
+    assert alone.layers["indirect"][metal].mean() > 0.5 * truth[0].layers["indirect"][metal].mean()
+
+
 def test_records_are_kept_and_used_again(tmp_path):
     """A second picture from the records of the first needs none and is the same; another size needs few."""
     scene = gi.scenes.cornell_box()

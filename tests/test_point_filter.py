@@ -266,6 +266,23 @@ def test_inside_of_a_sphere():
     np.testing.assert_allclose(picture, np.broadcast_to(expected.indirect_radiance, picture.shape), rtol=5e-3)
 
 
+def test_both_sides_have_points():
+    """A floor that is seen from the back of its triangles has the light of one that is seen from the front."""
+    floor = quad((-1, 0, 1), (2, 0, 0), (0, 0, -2)).shape(gi.Diffuse(0.5), "floor", smooth=False)
+    wall = quad((-1, 0, -1), (2, 0, 0), (0, 2, 0)).shape(gi.Diffuse(0.9), "wall", smooth=False)
+    camera, light = gi.Camera((0.2, 1.0, 2.4), (0, 0.1, 0)), gi.PointLight((0.5, 1.5, 0.5), 3.0)
+    sums = []
+    for front in (floor, replace(floor, faces=floor.faces[:, ::-1])):
+        scene = gi.Scene([front, wall], camera, [light])
+        sequence = gi.Sequence(1, lambda _, scene=scene: scene)
+        picture = gi.render_animation(sequence, gi.PointFilter(spp=2, rays=256), SIZE, 0, gi.Device("cpu"))[0]
+        assert picture.counts["fallback_hits"] < 20
+        on_floor = picture.layers["position"][..., 1:2] < 0.01
+        sums.append(np.where(on_floor, picture.layers["indirect"], 0.0).sum())
+    assert sums[0] > 0.0
+    assert sums[1] == pytest.approx(sums[0], rel=0.05)
+
+
 def test_same_for_any_number_of_threads(ball_run):
     """Points, light and pictures do not depend on threads or chunks."""
     other = run_of(ball(), device=gi.Device("cpu", 3, chunk=7))

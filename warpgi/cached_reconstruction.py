@@ -6,9 +6,10 @@ import numpy as np
 import warp as wp
 
 from warpgi.irradiance import SplatSource
+from warpgi.materials import Diffuse
 from warpgi.reconstruction import PrimaryHits, Reconstruction
 from warpgi.record_cache import Caching, RecordCache
-from warpgi.samples import SampleBuffer
+from warpgi.samples import NO_HIT, SampleBuffer
 
 
 class CachedReconstruction:
@@ -31,11 +32,15 @@ class CachedReconstruction:
         if hits is None:
             if samples.pixel is not None:
                 raise ValueError("samples lie irregularly, expected as many in each pixel for cache")
-            hits = PrimaryHits(samples.origin, samples.unit_origin_normal, samples.albedo, samples.spp)
+            hits = PrimaryHits(
+                samples.origin, samples.unit_origin_normal, samples.albedo, samples.spp, samples.material
+            )
         self.reconstruction, self.fallback_rays = reconstruction, fallback_rays
         self.caustics: wp.array | None = None
         size = (samples.width, samples.height)
-        self.cache = RecordCache(reconstruction.device, hits, size, SplatSource(reconstruction), caching)
+        self.cache = RecordCache(
+            reconstruction.device, hits, size, SplatSource(reconstruction), caching, None, glossy_hits(samples, hits)
+        )
 
     @property
     def samples(self) -> SampleBuffer:
@@ -57,3 +62,12 @@ class CachedReconstruction:
     def all_counts(self) -> dict[str, int]:
         """Records, hits without one, rays so far, and what was dropped, cut short or without support."""
         return self.reconstruction.all_counts() | self.cache.all_counts()
+
+
+def glossy_hits(samples: SampleBuffer, hits: PrimaryHits) -> np.ndarray:
+    """Numbers of the primary hits whose light depends on where it is seen from, int32: no irradiance serves them."""
+    if hits.material is None:
+        return np.zeros(0, np.int32)
+    glossy = np.array([not isinstance(material, Diffuse) for material in samples.materials])
+    met = np.abs(hits.origin).max(axis=1) < NO_HIT
+    return np.flatnonzero(met & glossy[hits.material]).astype(np.int32)

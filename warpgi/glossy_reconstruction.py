@@ -52,7 +52,7 @@ class GlossyReconstruction(Reconstruction):
     ) -> None:
         device.load(GLOSSY_KERNELS)
         self.bandwidth = bandwidth and samples.kappa is not None
-        self.surfaces = _surfaces(samples, hits, device)
+        self.surfaces = surfaces_of(samples, hits, device)
         super().__init__(
             samples, device, preprocessing, seed, hits, recursions=recursions, recursive_rays=recursive_rays
         )
@@ -209,7 +209,7 @@ def lobe_order(state: Reconstruction, axes: wp.array, kappa: wp.array, chosen: n
     return values[:count].contiguous()
 
 
-def _surfaces(samples: SampleBuffer, hits: PrimaryHits | None, device: Device) -> kernels.Surfaces:
+def surfaces_of(samples: SampleBuffer, hits: PrimaryHits | None, device: Device) -> kernels.Surfaces:
     """BSDFs of the primary hits at which light is gathered."""
     surfaces = kernels.Surfaces()
     known = samples if hits is None else hits

@@ -109,6 +109,7 @@ class RecordCache:
         source: where irradiance comes from.
         caching: how.
         known: records to begin with.
+        apart: numbers of primary hits that are gathered one by one, as their surfaces are not diffuse; None: none.
     """
 
     def __init__(
@@ -119,6 +120,7 @@ class RecordCache:
         source: IrradianceSource,
         caching: Caching,
         known: Records | None = None,
+        apart: np.ndarray | None = None,
     ) -> None:
         self.device, self.size, self.source, self.caching, self._hits = device, size, source, caching, hits
         self.rounds = caching.rounds
@@ -126,9 +128,14 @@ class RecordCache:
         self.record_pixels = np.zeros(0, np.int64)
         self._albedo = device.array(hits.albedo, wp.vec3)
         self._struct = kernels.Hits()
-        self._struct.origins, self._struct.normals = (device.array(a, wp.vec3) for a in (hits.origin, hits.normal))
+        self.apart = np.zeros(0, np.int32) if apart is None else apart
+        origins = hits.origin
+        if len(self.apart):
+            origins = origins.copy()
+            origins[self.apart] = NO_HIT
+        self._struct.origins, self._struct.normals = (device.array(a, wp.vec3) for a in (origins, hits.normal))
         self._struct.per_pixel, (self._struct.width, self._struct.height) = hits.per_pixel, size
-        x, y, z = np.abs(hits.origin).T
+        x, y, z = np.abs(origins).T
         reach = np.maximum(np.maximum(x, y), z)
         met = reach < NO_HIT
         largest = float(reach[met].max(initial=1e-30))
@@ -136,6 +143,8 @@ class RecordCache:
         self._build()
         self.rounds_done = 0
         self.counts = {"records": len(self.records), "fallback_hits": 0, "hits": int(np.count_nonzero(met))}
+        if len(self.apart):
+            self.counts["glossy_hits"] = len(self.apart)
 
     def fill(self, first: int, count: int) -> None:
         """Makes the records of rounds `first` to `first + count - 1`."""
@@ -156,12 +165,14 @@ class RecordCache:
         device.launch(kernels.interpolate, pixels, [self._kernel_records, hits, 0], [irradiance, uncovered])
         alone = np.flatnonzero(uncovered.numpy()).astype(np.int32)
         self.counts["fallback_hits"] = len(alone)
-        if len(alone):
-            # an unfinished cache leaves many, and is to be shown soon
-            rays = fallback_rays if self.rounds_done == len(self.rounds) else 1
-            values = self.source.at_hits(alone, max(1, round(rays / self._hits.per_pixel)))
-            device.launch(kernels.place_irradiance, len(alone), [values, device.array(alone, int)], [irradiance])
-            self._smooth(uncovered, rays, irradiance)
+        # an unfinished cache leaves many, and is to be shown soon
+        rays = fallback_rays if self.rounds_done == len(self.rounds) else 1
+        for some in (alone, self.apart):
+            if len(some):
+                values = self.source.at_hits(some, max(1, round(rays / self._hits.per_pixel)))
+                device.launch(kernels.place_irradiance, len(some), [values, device.array(some, int)], [irradiance])
+            if some is alone and len(some):
+                self._smooth(uncovered, rays, irradiance)
         device.launch(kernels.reflect_irradiance, count, [irradiance, self._albedo], [reflected])
         return reflected
 

@@ -7,13 +7,15 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warpgi.glossy_reconstruction import surfaces_of
 from warpgi.job import Job
 from warpgi.kernels import traced_gather
+from warpgi.kernels.glossy_light_field import Surfaces
 from warpgi.kernels.hemisphere import Hemispheres
 from warpgi.kernels.light_field import Gathered, Receivers
 from warpgi.kernels.path import PathSettings
 from warpgi.kernels.scene import OFFSET_ULPS
-from warpgi.reconstruction import Reconstruction
+from warpgi.reconstruction import PrimaryHits, Reconstruction
 
 #: What it launches beside a reconstruction.
 KERNELS = (traced_gather.gather_traced,)
@@ -33,6 +35,17 @@ class TracedReconstruction(Reconstruction):
     def __init__(self, job: Job, paths: PathSettings, *arguments: Any, **more: Any) -> None:
         self.scene, self.paths = job.scene, paths
         super().__init__(*arguments, **more)
+
+    def _upload(self, splats: np.ndarray, receivers: PrimaryHits | None) -> None:
+        super()._upload(splats, receivers)
+        self.surfaces = surfaces_of(self.samples, receivers, self.device)
+
+    def _relight(self, splats: np.ndarray, rays: int) -> None:
+        # what a glossy splat sent is no multiple of the light that all directions bring it
+        kappa = self.samples.kappa
+        surfaces, self.surfaces = self.surfaces, Surfaces()
+        super()._relight(splats if kappa is None else splats[kappa[splats] == 0.0], rays)
+        self.surfaces = surfaces
 
     def all_counts(self) -> dict[str, int]:
         """Rays so far, and those of them that became paths."""
@@ -58,6 +71,6 @@ class TracedReconstruction(Reconstruction):
         self.device.launch(traced_gather.trace_splat_strata, count, inputs, outputs)
 
     def _trace(self, receivers: Receivers, gathered: Gathered, size: int, first: int, count: int, each: int) -> None:
-        inputs = [self.scene.struct, self._light, receivers, each, first, count, self.seed]
+        inputs = [self.scene.struct, self._light, self.surfaces, receivers, each, first, count, self.seed]
         self.device.launch(traced_gather.gather_traced, size, inputs, [gathered])
         self.counts["reconstruction_rays"] += size * count

@@ -201,7 +201,7 @@ class LightField:
             self.roulette_depth or NEVER,
             self.sampler,
             with_hit_light=self.recursive > 0,
-            with_gloss=job.scene.scene.is_glossy and not self.photons and not self.cache,
+            with_gloss=job.scene.scene.is_glossy and not self.photons,
         )
         caustics = light_by_photons(job, self.photons, samples, hits) if self.photons else None
         state = self.reconstruction(samples, job.device, job.seed, hits, job)
@@ -228,8 +228,6 @@ class LightField:
         elif samples.material is not None or bandwidth:
             make = partial(GlossyReconstruction, bandwidth=bandwidth)
         how = {"recursions": self.recursive, "recursive_rays": self.recursive_rays}
-        if self.cache and samples.material is not None:
-            raise ValueError("samples hold glossy surfaces, expected only diffuse ones for cache")
         state: Reconstruction = make(samples, device, self.preprocessing, seed, hits, **how)
         return CachedReconstruction(state, hits, self.caching, self.rays) if self.cache else state
 

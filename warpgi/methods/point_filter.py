@@ -27,7 +27,7 @@ from warpgi.sampling import PRIMARY_BYTES
 if TYPE_CHECKING:
     from warpgi.point_animation import FramePoints
 
-#: Below, harmonics would be too many: 300 for a lobe of this roughness.
+#: Below, harmonics would be too many: some 350 for a lobe of this roughness.
 LEAST_ROUGHNESS = 0.005
 
 #: Device bytes of a primary hit beside those of tracing it: its place, irradiance, what it reflects, a mark.
@@ -65,7 +65,7 @@ class PointFilter:
     """Largest number that is chosen; memory grows with it."""
     per_point: bool = True
     """Choose the number for every point too, never above that of the whole: the least of bias and noise around it."""
-    roughness: float | None = 0.02
+    roughness: float | None = 0.01
     """Least roughness of glossy surfaces that take part, above 0: their points keep spherical harmonics, about 1.5 over
     it of them; None: no glossy surface does."""
     lobe_rays: int = 128
