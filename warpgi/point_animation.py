@@ -166,7 +166,9 @@ class PointRun:
             values = {}
             for light in self.lights:
                 found, rays = light.trace(job)
-                values[light.name] = np.where(np.isfinite(found), found, np.float32(0.0))
+                finite = np.isfinite(found)
+                values[light.name] = np.where(finite, found, np.float32(0.0))
+                self.counts["nonfinite"] += int(np.count_nonzero(~finite.all(axis=(1, 2))))
                 self.counts["point_rays"] += rays
         if self.files is None:
             self._values[number] = values
@@ -220,12 +222,10 @@ class PointRun:
         signed = light.width > 1
         return Projection(matrix, self.method.filter, size, smooth, signed)
 
-    def _job(self, number: int, seed: int = 0) -> Job:
+    def _job(self, number: int, seed: int) -> Job:
         on_device = DeviceScene(self.sequence.scene(number), self.device, self._before)
         self._before = on_device
-        return Job(
-            on_device, on_device.camera(self.size), self.size, seed or frame_seed(self.seed, number), self.device
-        )
+        return Job(on_device, on_device.camera(self.size), self.size, seed, self.device)
 
     def _path(self, number: int) -> Path:
         assert self.files is not None

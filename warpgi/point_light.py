@@ -28,8 +28,9 @@ from warpgi.surface_points import PointLookup, SurfacePoints
 # Part of a lobe that harmonics above the largest order may hold.
 LOST = 0.05
 
-# Values of hits, vec3, that are on the device at a time.
+# Values of hits, vec3, and hits themselves, with the points that each finds, that are on the device at a time.
 HIT_VALUES = 1 << 22
+HITS = 1 << 18
 
 
 def order_for(roughness: float) -> int:
@@ -93,7 +94,7 @@ class Irradiance:
         device, counts = job.device, {"fallback_hits": 0, "fallback_rays": 0}
         irradiance = device.zeros(len(hits.origin), wp.vec3)
         source = PathSource(job, hits, _paths(job, self.method))
-        for some in _on(job.scene, hits, self._diffuse, HIT_VALUES):
+        for some in _on(job.scene, hits, self._diffuse, HITS):
             mixed, found = self.lookup.at_hits(job.scene, hits, some, values)
             inputs = [mixed, device.array(some, int)]
             device.launch(irradiance_cache.place_irradiance, len(some), inputs, [irradiance])
@@ -159,7 +160,7 @@ class Harmonics:
         lobes.face, lobes.material = device.array(hits.face, int), device.array(hits.material, int)
         lobes.per_pixel = hits.per_pixel
         rays = max(1, round(self.method.lobe_rays / hits.per_pixel))
-        for some in _on(job.scene, hits, self._glossy, max(1, HIT_VALUES // self.width)):
+        for some in _on(job.scene, hits, self._glossy, min(HITS, max(1, HIT_VALUES // self.width))):
             mixed, found = self.lookup.at_hits(job.scene, hits, some, values)
             dark += int(np.count_nonzero(found == 0))
             lobes.hits = device.array(some, int)
