@@ -631,7 +631,7 @@ def test_usd_without_pxr_names_the_extra(tmp_path, monkeypatch):
     """Where usd-core is missing the error says what to install."""
     (tmp_path / "a.usda").write_text("#usda 1.0\n")
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(RuntimeError, match=r"pip install warpgi\[usd\]"):
+    with pytest.raises(ImportError, match=r"pip install warpgi\[usd\]"):
         load_scene(tmp_path / "a.usda")
 
 

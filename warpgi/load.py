@@ -47,7 +47,7 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
         FileNotFoundError: there is no such file.
         ValueError: its extension is unknown, it is damaged or has no triangles, or it refers to a texture that is
             missing or to a file outside its folder.
-        RuntimeError: it is a USD file and usd-core is not installed.
+        ImportError: it is a USD file and usd-core is not installed.
 
     Example:
         >>> import pathlib, tempfile, warpgi as gi
@@ -89,7 +89,7 @@ def _reader(path: Path, suffix: str) -> Callable[[Path], Parts]:
 
         return {".obj": load_mesh.read_obj, ".ply": load_mesh.read_ply, ".stl": load_mesh.read_stl}[suffix]
     if importlib.util.find_spec("pxr") is None:
-        raise RuntimeError(f"{path.name} needs usd-core, which is not installed: pip install warpgi[usd]")
+        raise ImportError(f"{path.name} needs usd-core, which is not installed: pip install warpgi[usd]")
     from warpgi.load_usd import read_usd
 
     return read_usd
