@@ -141,7 +141,7 @@ class Harmonics:
         rings, sectors = strata(self.method.rays)
         size, device = rings * sectors, job.device
         paths, step = _paths(job, self.method), float(OFFSET_ULPS) * job.scene.radius
-        batch = max(1, STRATA_BYTES // (28 * size))
+        batch = max(1, STRATA_BYTES // (28 * size + 16 * self.width))
         parts = []
         for start in range(0, len(position), batch):
             some = slice(start, start + batch)
