@@ -12,7 +12,7 @@ from warpgi.kernels.path import PathSettings
 from warpgi.kernels.path_strata import incident_light
 from warpgi.kernels.rng import INDEPENDENT, SOBOL, SOBOL_PAIRS, make_sampler, sample_2d
 from warpgi.kernels.sampling import PI, make_frame, to_world
-from warpgi.kernels.scene import Scene, triangle_at
+from warpgi.kernels.scene import DIFFUSE, Scene, triangle_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -172,11 +172,13 @@ def reflect_harmonics(
     count = (order + 1) * (order + 1)
     start = i * count
     shape = scene.shapes[lobes.material[h]]
+    # where a shape is diffuse in this frame its albedo is what multiplies, and is not in the BSDF as well
+    reflectance = wp.where(shape.kind == DIFFUSE, wp.vec3(1.0), lobes.reflectance[h])
     total = wp.vec3(0.0)
     for ray in range(rays):
         number = (h % lobes.per_pixel) * rays + ray
         u = sample_2d(make_sampler(seed, h // lobes.per_pixel, number, SOBOL), LOBE_PAIR)
-        b = sample(shape, lobes.reflectance[h], lobes.normal[h], lobes.wo[h], u)
+        b = sample(shape, reflectance, lobes.normal[h], lobes.wo[h], u)
         if b.weight[0] + b.weight[1] + b.weight[2] > 0.0:
             fill_harmonics(harmonics, start, order, to_rest(scene, rest, lobes.face[h], b.wi))
             light = wp.vec3(0.0)

@@ -3,6 +3,7 @@
 import os
 import signal
 import socket
+import subprocess
 import sys
 import threading
 
@@ -191,6 +192,27 @@ def test_a_scheduler_without_workers(monkeypatch):
         pytest.raises(ConnectionError, match="has no worker, expected one: dask worker tcp://"),
     ):
         gi.render_animation(gi.scenes.moving_light(frames=1), PATH, SIZE, cluster=local.scheduler_address)
+
+
+def test_a_script_that_its_own_workers_run(tmp_path):
+    """A script that does not guard its main part against being imported is told so."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import warpgi as gi\n"
+        "sequence = gi.scenes.moving_light(frames=1)\n"
+        "gi.render_animation(sequence, gi.PathTracing(spp=1), (4, 4), device='cpu', cluster=True)\n"
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
+    assert done.returncode != 0
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith("ChildProcessError: cluster of this machine: processes did not start")
+    assert "under if __name__ == '__main__'" in last
+
+
+def test_a_module_that_workers_lack(client):
+    """It is named."""
+    with pytest.raises(ImportError, match="cluster test: a worker says No module named 'nowhere', expected it"):
+        list(clusters.Cluster(client, "test").run(__import__, [(0, "nowhere")]))
 
 
 def test_without_dask(monkeypatch, tmp_path, capsys):

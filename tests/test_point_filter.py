@@ -322,6 +322,18 @@ def test_resume_leaves_the_same_files(tmp_path):
     assert np.array_equal(second.modes.basis, gi.Modes.load(tmp_path / "modes.npz").basis)
 
 
+def test_light_that_is_no_number_is_counted(monkeypatch):
+    """A point without finite light is dark for that frame, and counted; the others keep theirs."""
+    run = run_of(still(1), traced=False)
+    (light,) = run.lights
+    values = np.ones((len(run.points), 1, 3), np.float32)
+    values[[1, 4], 0, 2] = np.nan, np.inf
+    monkeypatch.setattr(light, "trace", lambda job: (values, 0))
+    run.trace(0)
+    assert run.counts["nonfinite"] == 2
+    assert run._load("irradiance", 0).sum() == values.size - 2
+
+
 def test_on_the_command_line(tmp_path, capsys):
     """`warpgi animate` writes a picture a frame, and says how many modes there are."""
     arguments = ["moving-car:frames=3", "point-filter", "--spp", "1", "--rays", "4", "--size", "16", "9"]

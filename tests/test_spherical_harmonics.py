@@ -155,7 +155,7 @@ def test_lobe_against_quadrature(plate):
         np.zeros(count, np.int32),
         np.float32([(0.3, 0.3)]).repeat(count, 0),
     )
-    many = Harmonics(light.points, np.array([False]), plate.rest, gi.PointFilter(roughness=0.05, lobe_rays=4096))
+    many = Harmonics(light.points, np.array([True]), plate.rest, gi.PointFilter(roughness=0.05, lobe_rays=4096))
     reflected = plate.device.zeros(count, wp.vec3)
     values = np.tile(even[None].astype(np.float32), (len(light.points), 1, 1))
     assert many.reflect(job, hits, values, reflected) == {"dark_hits": 0}
@@ -236,3 +236,21 @@ def test_glossy_floor_agrees_with_path_tracing(material):
     blocks = [image.reshape(8, 4, 8, 4, 3).mean(axis=(1, 3)) for image in (ours, theirs)]
     assert np.abs(blocks[0] - blocks[1]).sum() < 0.1 * blocks[1].sum()
     np.testing.assert_allclose(picture.layers["direct"].mean(), truth.layers["direct"].mean(), rtol=0.02)
+
+
+def test_materials_that_change():
+    """A floor that is diffuse in one frame and metal in the next, by a wall that stays metal, has path tracing's light
+    in both: irradiance would serve the first alone. 256 paths at some hundred points leave a noise of 3 %."""
+    camera, light = gi.Camera((0.2, 1.0, 2.4), (0.0, 0.1, 0.0)), gi.PointLight((0.5, 1.5, 0.5), 3.0)
+    metal = gi.Conductor(roughness=0.1)
+    wall = quad((-1, 0, -1), (2, 0, 0), (0, 2, 0)).shape(metal, "wall", smooth=False)
+    floor = quad((-1, 0, 1), (2, 0, 0), (0, 0, -2)).shape(gi.Diffuse(0.7), "floor", smooth=False)
+    scenes = [gi.Scene([replace(floor, material=each), wall], camera, [light]) for each in (gi.Diffuse(0.7), metal)]
+    method = gi.PointFilter(spp=2, rays=256, spacing=2.0, modes=2, per_point=False)
+    size, device = (24, 24), gi.Device("cpu")
+    pictures = gi.render_animation(gi.Sequence(2, scenes.__getitem__), method, size, 0, device)
+    for picture, scene in zip(pictures, scenes, strict=True):
+        truth = gi.render(scene, gi.PathTracing(spp=512), size, 5, device)
+        on_floor = picture.layers["position"][..., 1] < 0.01
+        ours, theirs = (each.layers["indirect"][on_floor].mean() for each in (picture, truth))
+        assert ours == pytest.approx(theirs, rel=0.1)

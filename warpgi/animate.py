@@ -63,8 +63,9 @@ def render_animation(
             frame; False gives all frames the same, so that the frames of a still sequence are equal to the last bit.
         cluster: render frames on workers of Dask distributed, to the same last bit (`pip install warpgi[cluster]`):
             True for processes of this machine's that share its cores, the address of a scheduler, or a
-            `distributed.Client`. The sequence is pickled with the functions in it; files are written here. A worker
-            that dies leaves its frames to others.
+            `distributed.Client`. The sequence is pickled with the script's functions in it; those of other modules
+            are imported there. Files are written here. A worker that dies leaves its frames to others. Processes import
+            the script, so it must ask for them under `if __name__ == "__main__"`.
 
     Returns:
         The frames, with times and counts of what was rendered.
@@ -72,7 +73,7 @@ def render_animation(
     Raises:
         TypeError, ValueError: an argument is wrong, or a frame's scene is; frames before it stay.
         ImportError: `cluster` is asked for and Dask distributed is not installed.
-        OSError: a file cannot be written, or the cluster cannot be reached.
+        OSError: a file cannot be written, or the cluster cannot be reached or started.
         KeyboardInterrupt: Ctrl-C; files of finished frames stay.
 
     Example:
@@ -97,7 +98,7 @@ def render_animation(
     if resume and out is None:
         raise ValueError("resume is True, expected False where out is None: there are no files to go on from")
     if on_points is not None:
-        if cluster is not False:
+        if cluster is not False and cluster is not None:
             raise ValueError("cluster is given, expected False: PointFilter renders on this machine alone")
         return render_points(sequence, on_points, size, seed, as_device(device), progress, out, resume, numbers)
     pattern = None if out is None else noisy_pattern(out) if filtered else out

@@ -45,7 +45,7 @@ class Cluster:
 
         Raises:
             OSError: workers died again and again at the same task, or the scheduler is gone.
-            ImportError: warpgi is not installed there.
+            ImportError: warpgi, or another module that the work is from, is not installed there.
             What `work` raises.
         """
         from distributed import as_completed
@@ -95,7 +95,7 @@ class Cluster:
             raise ConnectionError(f"cluster {self.name}: the scheduler is gone, expected it to stay") from error
         except ImportError as error:
             raise ImportError(
-                f"cluster {self.name}: a worker says {error}, expected warpgi to be installed there"
+                f"cluster {self.name}: a worker says {error}, expected it to be installed there"
             ) from error
 
 
@@ -112,6 +112,7 @@ def open_cluster(cluster: Any, device: Device) -> Iterator[Cluster | None]:
         TypeError, ValueError: it is no such thing.
         ImportError: Dask distributed is not installed.
         ConnectionError: there is no scheduler, or it has no worker.
+        ChildProcessError: processes of this machine's do not start.
     """
     if cluster is False or cluster is None:
         yield None
@@ -148,6 +149,11 @@ def _local_workers(device: Device) -> Any:
             memory_limit=None,
             silence_logs="CRITICAL",
         )
+    except RuntimeError as error:
+        raise ChildProcessError(
+            f"cluster of this machine: processes did not start ({error}); they import the script, "
+            "expected it to ask for them under if __name__ == '__main__':"
+        ) from error
     finally:
         if ours:
             signal.signal(signal.SIGINT, before)

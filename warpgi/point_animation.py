@@ -28,7 +28,7 @@ from warpgi.image import atomic_write
 from warpgi.job import Job
 from warpgi.methods.path import NEVER
 from warpgi.methods.point_filter import PointFilter
-from warpgi.point_light import PointLight, lights_at
+from warpgi.point_light import PointLight, glossy_shapes, lights_at
 from warpgi.progress import Progress, progress_bar
 from warpgi.render import render_scene
 from warpgi.result import Render
@@ -129,6 +129,7 @@ class PointRun:
         pixels = size[0] * size[1] * len(numbers)
         self._rays_per_pixel = min(max(1, -(-LEAST_PLACES // pixels)), MOST_RAYS_PER_PIXEL)
         self._before = self.rest
+        self._glossy = np.zeros(len(self.rest.scene.shapes), bool)
         self._values: dict[int, dict[str, np.ndarray]] = {}
         self._identities: dict[int, str] = {}
 
@@ -138,8 +139,11 @@ class PointRun:
         Raises:
             ValueError: shapes move while its shutter is open.
         """
-        if self.sequence.scene(number).moves:
+        scene = self.sequence.scene(number)
+        if scene.moves:
             raise ValueError(f"frame {number}: the scene moves, which PointFilter cannot render, expected a still one")
+        # materials may change from frame to frame
+        self._glossy |= glossy_shapes(scene, self.method)
         with self.timings.stage("points"):
             self._collector.add_frame(self._job(number, frame_seed(self.seed, number)), self._rays_per_pixel)
 
@@ -147,7 +151,7 @@ class PointRun:
         """Chooses the points, once all frames were looked at."""
         with self.timings.stage("points"):
             self.points = self._collector.points()
-            self.lights = lights_at(self.points, self.rest.scene, self.rest, self.method)
+            self.lights = lights_at(self.points, self._glossy, self.rest, self.method)
         self.counts["points"] = len(self.points)
 
     def trace(self, number: int) -> None:
@@ -156,7 +160,7 @@ class PointRun:
         seed = frame_seed(frame_seed(self.seed, number), number)  # other random numbers than the picture's
         scene = self.sequence.scene(number)
         paths = (method.rays, method.roughness, method.max_depth, method.roulette_depth, method.sampler)
-        where = (points.face, points.bary, points.side)
+        where = (points.face, points.bary, points.side, self._glossy)
         identity = fingerprint(FORMAT, warpgi.__version__, paths, seed, scene, where)
         self._identities[number] = identity
         if self.resume and self._found(number, identity):
@@ -166,7 +170,9 @@ class PointRun:
             values = {}
             for light in self.lights:
                 found, rays = light.trace(job)
-                values[light.name] = np.where(np.isfinite(found), found, np.float32(0.0))
+                finite = np.isfinite(found)
+                values[light.name] = np.where(finite, found, np.float32(0.0))
+                self.counts["nonfinite"] += int(np.count_nonzero(~finite.all(axis=(1, 2))))
                 self.counts["point_rays"] += rays
         if self.files is None:
             self._values[number] = values
@@ -220,12 +226,10 @@ class PointRun:
         signed = light.width > 1
         return Projection(matrix, self.method.filter, size, smooth, signed)
 
-    def _job(self, number: int, seed: int = 0) -> Job:
+    def _job(self, number: int, seed: int) -> Job:
         on_device = DeviceScene(self.sequence.scene(number), self.device, self._before)
         self._before = on_device
-        return Job(
-            on_device, on_device.camera(self.size), self.size, seed or frame_seed(self.seed, number), self.device
-        )
+        return Job(on_device, on_device.camera(self.size), self.size, seed, self.device)
 
     def _path(self, number: int) -> Path:
         assert self.files is not None

@@ -16,7 +16,7 @@ from warpgi.kernels import irradiance_cache
 from warpgi.kernels import spherical_harmonics as kernels
 from warpgi.kernels.path import PathSettings
 from warpgi.kernels.scene import OFFSET_ULPS
-from warpgi.materials import Diffuse
+from warpgi.materials import Coated, Conductor
 from warpgi.methods.path import NEVER
 from warpgi.methods.point_filter import PointFilter
 from warpgi.reconstruction import PrimaryHits
@@ -28,8 +28,9 @@ from warpgi.surface_points import PointLookup, SurfacePoints
 # Part of a lobe that harmonics above the largest order may hold.
 LOST = 0.05
 
-# Values of hits, vec3, that are on the device at a time.
+# Values of hits, vec3, and hits themselves, with the points that each finds, that are on the device at a time.
 HIT_VALUES = 1 << 22
+HITS = 1 << 18
 
 
 def order_for(roughness: float) -> int:
@@ -58,15 +59,28 @@ class PointLight(Protocol):
         """Writes what primary hits on such surfaces reflect of the points' values; returns counts."""
 
 
+def glossy_shapes(scene: Scene, method: PointFilter) -> np.ndarray:
+    """Which shapes are glossy and take part, shape (S,), bool."""
+    least = np.inf if method.roughness is None else method.roughness
+    materials = [shape.material for shape in scene.shapes]
+    return np.array([isinstance(each, (Conductor, Coated)) and each.roughness >= least for each in materials])
+
+
 def lights_at(
-    points: SurfacePoints, scene: Scene, rest: DeviceScene, method: PointFilter
+    points: SurfacePoints, glossy: np.ndarray, rest: DeviceScene, method: PointFilter
 ) -> list[Irradiance | Harmonics]:
-    """What is to be known at points, each at one kind of them: no more than the scene needs."""
-    diffuse = np.array([isinstance(shape.material, Diffuse) for shape in scene.shapes])
+    """What is to be known at points, each at one kind of them: no more than the sequence needs.
+
+    Args:
+        points: where it is to be known.
+        glossy: which shapes are glossy in any frame: irradiance does not serve them, harmonics serve them always.
+        rest: the scene whose distances count.
+        method: settings.
+    """
     found: list[Irradiance | Harmonics] = []
-    for kind, some in ((Irradiance, diffuse[points.shape]), (Harmonics, ~diffuse[points.shape])):
+    for kind, some in ((Irradiance, ~glossy[points.shape]), (Harmonics, glossy[points.shape])):
         if some.any():
-            found.append(kind(points.some(some), diffuse, rest, method))
+            found.append(kind(points.some(some), glossy, rest, method))
     return found
 
 
@@ -75,8 +89,8 @@ class Irradiance:
 
     name, width = "irradiance", 1
 
-    def __init__(self, points: SurfacePoints, diffuse: np.ndarray, rest: DeviceScene, method: PointFilter) -> None:
-        self.points, self.method, self._diffuse = points, method, diffuse
+    def __init__(self, points: SurfacePoints, glossy: np.ndarray, rest: DeviceScene, method: PointFilter) -> None:
+        self.points, self.method, self._others = points, method, ~glossy
         self.lookup = PointLookup(points, rest)
 
     def trace(self, job: Job) -> tuple[np.ndarray, int]:
@@ -93,7 +107,7 @@ class Irradiance:
         device, counts = job.device, {"fallback_hits": 0, "fallback_rays": 0}
         irradiance = device.zeros(len(hits.origin), wp.vec3)
         source = PathSource(job, hits, _paths(job, self.method))
-        for some in _on(job.scene, hits, self._diffuse, HIT_VALUES):
+        for some in _on(job.scene, hits, self._others, HITS):
             mixed, found = self.lookup.at_hits(job.scene, hits, some, values)
             inputs = [mixed, device.array(some, int)]
             device.launch(irradiance_cache.place_irradiance, len(some), inputs, [irradiance])
@@ -114,8 +128,8 @@ class Harmonics:
 
     name = "harmonics"
 
-    def __init__(self, points: SurfacePoints, diffuse: np.ndarray, rest: DeviceScene, method: PointFilter) -> None:
-        self.points, self.method, self.rest, self._glossy = points, method, rest, ~diffuse
+    def __init__(self, points: SurfacePoints, glossy: np.ndarray, rest: DeviceScene, method: PointFilter) -> None:
+        self.points, self.method, self.rest, self._glossy = points, method, rest, glossy
         self.lookup = PointLookup(points, rest)
         assert method.roughness is not None
         self.order = order_for(method.roughness)
@@ -127,7 +141,7 @@ class Harmonics:
         rings, sectors = strata(self.method.rays)
         size, device = rings * sectors, job.device
         paths, step = _paths(job, self.method), float(OFFSET_ULPS) * job.scene.radius
-        batch = max(1, STRATA_BYTES // (28 * size))
+        batch = max(1, STRATA_BYTES // (28 * size + 16 * self.width))
         parts = []
         for start in range(0, len(position), batch):
             some = slice(start, start + batch)
@@ -159,7 +173,7 @@ class Harmonics:
         lobes.face, lobes.material = device.array(hits.face, int), device.array(hits.material, int)
         lobes.per_pixel = hits.per_pixel
         rays = max(1, round(self.method.lobe_rays / hits.per_pixel))
-        for some in _on(job.scene, hits, self._glossy, max(1, HIT_VALUES // self.width)):
+        for some in _on(job.scene, hits, self._glossy, min(HITS, max(1, HIT_VALUES // self.width))):
             mixed, found = self.lookup.at_hits(job.scene, hits, some, values)
             dark += int(np.count_nonzero(found == 0))
             lobes.hits = device.array(some, int)

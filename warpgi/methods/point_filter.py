@@ -27,7 +27,7 @@ from warpgi.sampling import PRIMARY_BYTES
 if TYPE_CHECKING:
     from warpgi.point_animation import FramePoints
 
-#: Below, harmonics would be too many: some 350 for a lobe of this roughness.
+#: Below, harmonics would be too many: 361 for a lobe of this roughness.
 LEAST_ROUGHNESS = 0.005
 
 #: Device bytes of a primary hit beside those of tracing it: its place, irradiance, what it reflects, a mark.
@@ -40,8 +40,9 @@ class PointFilter:
 
     Points are fixed to surfaces wherever any frame sees them, as dense as the camera's path asks for; each frame's
     irradiance at all of them is traced with few paths, filtered in time by its principal components, and looked up by
-    the pictures. So what a point knows over time is light alone, whatever moves or deforms. Diffuse surfaces take part;
-    others keep light that is path-traced from each pixel.
+    the pictures. So what a point knows over time is light alone, whatever moves or deforms. Diffuse surfaces take
+    part, and glossy ones with harmonics of the light in place of irradiance, down to `roughness`; sharper ones, mirrors
+    and glass keep light that is path-traced from each pixel.
 
     Raises:
         TypeError, ValueError: a setting is out of range.
@@ -66,7 +67,7 @@ class PointFilter:
     per_point: bool = True
     """Choose the number for every point too, never above that of the whole: the least of bias and noise around it."""
     roughness: float | None = 0.01
-    """Least roughness of glossy surfaces that take part, above 0: their points keep spherical harmonics, about 1.5 over
+    """Least roughness of glossy surfaces that take part, 0.005 to 1: their points keep harmonics, about 2 over
     it of them; None: no glossy surface does."""
     lobe_rays: int = 128
     """Directions per pixel by which glossy surfaces ask for these."""
