@@ -88,10 +88,16 @@ def _shrinking(budget: Budget) -> Panels:
 def _gloss(budget: Budget) -> Panels:
     depth = 3  # one bounce of indirect light, as in the paper
     methods = {"input, 8 spp": gi.PathTracing(spp=8, max_depth=depth, roulette_depth=None)}
-    methods |= light_fields(budget, 8, light_field={"max_depth": depth})
-    # as denoisers of the input: those of sample buffers work on what diffuse surfaces reflect
-    filters = {"a-trous": gi.ATrous(), "a-trous, less": gi.ATrous(sigma_color=16.0)}
-    return indirect(budget, gi.scenes.statuettes, methods, depth, filters)
+    variants = {"light_field": {"max_depth": depth}, "without_bandwidth": {"max_depth": depth, "bandwidth": False}}
+    methods |= light_fields(budget, 8, **variants)
+    filtered = {"spp": 8, "max_depth": depth, "glossy": True}
+    # the secondary normal's sigma is that of least error among 0.1 to 4
+    methods |= {
+        "a-trous": gi.ATrous(**filtered),
+        "a-trous, secondary normal": gi.ATrous(**filtered, sigma_hit_normal=1.0),
+        "random parameter filter": gi.RandomParameterFilter(**filtered),
+    }
+    return indirect(budget, gi.scenes.statuettes, methods, depth)
 
 
 def _bandwidth(budget: Budget) -> Panels:

@@ -71,6 +71,7 @@ class SampleArrays:
     layer: wp.array[int]  # that the secondary ray was drawn from, COAT or BASE
     bandwidth: wp.array[float]  # Blinn exponent at the secondary hit
     base_radiance: wp.array[wp.vec3]  # part of the radiance that left the secondary hit by way of a diffuse layer
+    weight: wp.array[wp.vec3]  # BSDF times cosine over density of the secondary ray, 1 where diffuse
     # where the scene has mirrors too: the segment after one that the secondary ray met, with all light along it
     mirror: wp.array[wp.vec3]  # what it reflects; 0 where none was met
     beyond_hit: wp.array[wp.vec3]
@@ -320,6 +321,8 @@ def trace_samples(
                             samples.layer[k] = b.layer
                         samples.bandwidth[k] = gathered.bandwidth
                         samples.base_radiance[k] = gathered.base
+                        if samples.weight.shape[0] > 0:
+                            samples.weight[k] = wp.where(shape.kind == DIFFUSE, wp.vec3(1.0), b.weight)
                     if gathered.depth >= 0.0:
                         samples.hit[k] = gathered.position
                         samples.hit_normal[k] = gathered.normal

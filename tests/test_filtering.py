@@ -232,9 +232,70 @@ def test_refusals(kind):
         gi.reconstruct(samples, kind(), device=gi.Device("cpu", memory_limit=1000))
     metal = gi.Shape([(-1, 0, -1), (-1, 0, 1), (1, 0, 1)], [(0, 1, 2)], gi.Conductor(0.05))
     scene = gi.Scene([metal], gi.Camera((0, 1, 1), (0, 0, 0)), [gi.Environment((1, 1, 1))])
-    with pytest.raises(ValueError, match="glossy primary hits"):
-        gi.reconstruct(gi.sample(scene, 1, (8, 8), glossy=True), gi.ATrous())
+    words = "without weight" if hasattr(kind, "glossy") else "expected only diffuse ones"
+    with pytest.raises(ValueError, match=f"glossy primary hits.*{words}"):
+        gi.reconstruct(replace(gi.sample(scene, 1, (8, 8), glossy=True), weight=None), kind())
     with pytest.raises(ValueError, match="spp is 0"):
         kind(spp=0)
     with pytest.raises(ValueError, match="never end"):
         kind(roulette_depth=None)
+
+
+def glossy_room():
+    """Everything that a glossy hit can be: metal, black metal, coats over colour and black, seen in a mirror too."""
+    plate = np.array([(-1, 0, -1), (-1, 0, 1), (1, 0, 1), (1, 0, -1)], float)
+    faces = [(0, 1, 2), (0, 2, 3)]
+    materials = [
+        gi.Conductor(0.05, (0.9, 0.6, 0.3)),
+        gi.Conductor(0.3, (0.0, 0.0, 0.0)),
+        gi.Coated((0.2, 0.5, 0.7), 0.02),
+        gi.Coated((0.0, 0.0, 0.0), 0.1),
+        gi.Diffuse((0.4, 0.5, 0.6)),
+    ]
+    shapes = [gi.Shape(plate + np.array([2 * i - 4, 0, 0]), faces, material) for i, material in enumerate(materials)]
+    wall = [(-5, 0, -1), (5, 0, -1), (5, 4, -1), (-5, 4, -1)]
+    mirror = [(2, 0, -0.5), (5, 0, -0.5), (5, 3, -0.5), (2, 3, -0.5)]
+    shapes += [gi.Shape(wall, faces, gi.Diffuse((0.7, 0.8, 0.5))), gi.Shape(mirror, faces, gi.Mirror((0.9, 0.8, 0.7)))]
+    return gi.Scene(shapes, gi.Camera((0, 3, 7), (0, 0.8, 0), fov=60.0), [gi.PointLight((0, 3, 3), (400, 400, 400))])
+
+
+def test_glossy_light_is_held_pixel_by_pixel():
+    """A filter too narrow to reach another sample leaves what glossy surfaces reflect as it is without it.
+
+    The paths are the same, so that the pictures are too: light divided by reflectance and multiplied again, with
+    samples that were absorbed counted as black. That each is float32's rounding of one product more bounds the rest.
+    """
+    scene, size = glossy_room(), (48, 32)
+    narrow = {"spp": 4, "sigma_position": 1e-6, "sigma_normal": None, "iterations": 1}
+    kept, filtered = (
+        gi.render(scene, gi.ATrous(glossy=glossy, **narrow), size, 3).layers["indirect"] for glossy in (False, True)
+    )
+    assert kept.mean() > 0.01
+    np.testing.assert_allclose(filtered, kept, rtol=32 * 2.0**-24, atol=1e-6)
+    buffer = gi.sample(scene, 4, size, 3, glossy=True)
+    assert set(np.unique(buffer.material[buffer.checked.is_primary])) == set(range(6))
+
+
+@pytest.mark.parametrize("sigma", [None, 1.0])
+def test_statuettes_have_less_noise_and_keep_their_light(sigma):
+    """What only glossy surfaces reflect has less error by a fifth, and its mean light but for 6 %.
+
+    The mean differs from the input's by 3 % here over 12 seeds, as rows at edges have fewer others to share with; twice
+    that is the bound.
+    """
+    scene, size = gi.scenes.statuettes(resolution=24), (64, 36)
+    methods = gi.PathTracing(spp=8, max_depth=3), gi.ATrous(glossy=True, max_depth=3, sigma_hit_normal=sigma)
+    truth = gi.render(scene, gi.PathTracing(spp=256, max_depth=3), size, 9).layers["indirect"]
+    pictures = [[gi.render(scene, m, size, seed).layers["indirect"] for seed in range(4)] for m in methods]
+    before, after = (np.mean([gi.compare(p, truth)["rmse"] ** 2 for p in row]) for row in pictures)
+    assert after < 0.8 * before
+    assert np.mean(pictures[1], dtype=float) == pytest.approx(np.mean(pictures[0], dtype=float), rel=0.06)
+
+
+def test_random_parameter_filter_gives_glossy_light_back():
+    """It changes the picture of metal, not its mean light; whether error falls depends on the picture."""
+    scene, size = gi.scenes.statuettes(resolution=24), (48, 27)
+    methods = (gi.RandomParameterFilter(glossy=glossy, max_depth=3, boxes=(7,)) for glossy in (False, True))
+    kept, filtered = (gi.render(scene, method, size, 1).layers["indirect"] for method in methods)
+    assert gi.compare(filtered, kept)["relmse"] > 0.01
+    np.testing.assert_allclose(filtered.mean(axis=(0, 1), dtype=float), kept.mean(axis=(0, 1), dtype=float), rtol=1e-5)

@@ -24,6 +24,9 @@ from warpgi.sampling import PRIMARY_BYTES, SECONDARY_BYTES, trace_sample_buffer
 # Below this share of reflected light, albedo does not explain what a pixel shows: metal in a layer of diffuse colour.
 SMALLEST_ALBEDO = 1e-3
 
+# Least that light of glossy surfaces is divided by: normal reflectance of a coat, which is there over black too.
+COAT_REFLECTANCE = 0.04
+
 # Field of view, across the larger side, with which depth alone is taken for positions: tan of half of 40 degrees.
 ASSUMED_TAN = 0.364
 
@@ -107,17 +110,29 @@ class FilterInput:
 
 
 def sample_rows(samples: SampleBuffer) -> FilterInput:
-    """A row for each sample; only diffuse primary hits are in a buffer, and nothing else is filtered."""
+    """A row for each sample, diffuse primary hits and such glossy ones as are in the buffer.
+
+    What glossy hits reflect is divided by their reflectance, so that its texture stays sharp.
+    """
     _check_secondary(samples)
     primary, usable = _usable(samples)
     zero = np.float32(0.0)
+    radiance, albedo = samples.radiance, samples.albedo
+    glossy = _glossy(samples)
+    if glossy.any():
+        if samples.weight is None or samples.reflectance is None:
+            raise ValueError("samples hold glossy primary hits without weight or reflectance, expected both")
+        # a glossy hit that sent no ray, for all would be absorbed, has a ray of no length
+        usable |= glossy & (samples.hit == samples.origin).all(axis=1)
+        scale = np.where(glossy[:, None], np.maximum(samples.reflectance, np.float32(COAT_REFLECTANCE)), np.float32(1))
+        radiance, albedo = radiance * samples.weight / scale, albedo * scale
     return FilterInput(
         width=samples.width,
         height=samples.height,
         pixel=samples.pixel_of_sample,
-        value=np.where(usable[:, None], samples.radiance, zero),
+        value=np.where(usable[:, None], radiance, zero),
         known=np.repeat(usable[:, None], 3, axis=1).astype(np.float32),
-        albedo=np.where(primary[:, None], samples.albedo, zero),
+        albedo=np.where(primary[:, None], albedo, zero),
         rest=np.zeros((len(samples), 3), np.float32),
         normal=np.where(primary[:, None], samples.unit_origin_normal, zero),
         position=np.where(primary[:, None], samples.origin, zero),
@@ -130,6 +145,9 @@ def sample_rows(samples: SampleBuffer) -> FilterInput:
 def pixel_rows(samples: SampleBuffer) -> FilterInput:
     """A row for each pixel: means over its samples, with the harmonic mean distance of secondary hits."""
     _check_secondary(samples)
+    if _glossy(samples).any():
+        # what they reflect depends on where it is seen from
+        raise ValueError("samples hold glossy primary hits, expected only diffuse ones: those of glossy=False")
     primary, usable = _usable(samples)
     return _mean_rows(
         samples,
@@ -304,6 +322,11 @@ class SampleFilter:
         """Whether the picture of a scene without light is black."""
         return True
 
+    @property
+    def filters_gloss(self) -> bool:
+        """Whether it filters what glossy surfaces reflect too."""
+        return False
+
     def filter_bytes(self) -> int:
         """Device memory of the filter for one sample, or for its share of a pixel."""
         raise NotImplementedError
@@ -331,6 +354,7 @@ class SampleFilter:
 
     def prepare(self, job: Job, film: Film) -> Filtering:
         """Traces the input, with what is not filtered going to the film."""
+        with_gloss = self.filters_gloss and job.scene.scene.is_glossy
         samples, hits = trace_sample_buffer(
             job,
             film,
@@ -341,6 +365,9 @@ class SampleFilter:
             self.roulette_depth or NEVER,
             self.sampler,
             with_hit_light=False,
+            with_gloss=with_gloss,
+            with_weight=with_gloss,
+            with_beyond=False,
         )
         return self.filtering(samples, hits, job.device, job.seed)
 
@@ -384,11 +411,14 @@ def _faults(samples: SampleBuffer) -> dict[str, int]:
 def _check_secondary(samples: SampleBuffer) -> None:
     if not samples.has_secondary_rays:
         raise ValueError("samples hold no secondary rays, expected a sample buffer of format 2.0 or newer")
-    if samples.material is not None:
-        glossy = [number for number, material in enumerate(samples.materials) if not isinstance(material, Diffuse)]
-        if np.isin(samples.material[samples.checked.is_primary], glossy).any():
-            # their light would be multiplied by the albedo in place of the BSDF
-            raise ValueError("samples hold glossy primary hits, expected only diffuse ones: those of glossy=False")
+
+
+def _glossy(samples: SampleBuffer) -> np.ndarray:
+    """Which primary hits are not diffuse, shape (N,)."""
+    if samples.material is None:
+        return np.zeros(len(samples), bool)
+    glossy = [number for number, material in enumerate(samples.materials) if not isinstance(material, Diffuse)]
+    return samples.checked.is_primary & np.isin(samples.material, glossy)
 
 
 def _positions(layers: Mapping[str, np.ndarray]) -> np.ndarray:

@@ -36,7 +36,7 @@ OPTIONAL = {
 
 
 # Optional arrays that no version of the file format has.
-UNFILED = {"wo": 3, "reflectance": 3, "base_radiance": 3}
+UNFILED = {"wo": 3, "reflectance": 3, "base_radiance": 3, "weight": 3}
 UNFILED_INTEGERS = ("material", "layer")
 
 
@@ -135,7 +135,7 @@ class SampleBuffer:
     """Direct light at the secondary hit, part of `radiance` [W/(sr m^2)], shape (N, 3)."""
     wo: np.ndarray | None = None
     """Unit vector from `origin` to what sees it, shape (N, 3); goes with `material`. Files hold neither it nor the
-    four arrays below, which only glossy surfaces need."""
+    five arrays below, which only glossy surfaces need."""
     material: np.ndarray | None = None
     """Number in `materials` of the primary hit's, int32, shape (N,)."""
     reflectance: np.ndarray | None = None
@@ -146,6 +146,9 @@ class SampleBuffer:
     base_radiance: np.ndarray | None = None
     """Part of `radiance` that left the secondary hit by way of a diffuse layer, shape (N, 3); the rest has
     `bandwidth`."""
+    weight: np.ndarray | None = None
+    """What a glossy primary hit reflects of `radiance`, its BSDF times cosine over the density of the ray's direction;
+    1 where it is diffuse, shape (N, 3). Image-space filters need it."""
     materials: tuple[Any, ...] = ()
     """What `material` counts."""
     beyond: SampleBuffer | None = None
@@ -275,7 +278,7 @@ class SampleBuffer:
             self.wo,
             self.reflectance,
         )
-        ray = _finite(self.origin, self.hit, self.radiance)
+        ray = _finite(self.origin, self.hit, self.radiance, self.weight)
         rest = _finite(self.origin, self.bandwidth, self.hit_motion, self.time, self.throughput, self.hit_direct)
         rest = rest if self.base_radiance is None else rest & _finite(self.base_radiance)
         secondary = ray & (far | rest)

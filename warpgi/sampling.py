@@ -67,11 +67,14 @@ def trace_sample_buffer(
     sampler: Sampler,
     with_hit_light: bool,
     with_gloss: bool = False,
+    with_weight: bool = False,
+    with_beyond: bool = True,
 ) -> tuple[SampleBuffer, PrimaryHits]:
     """Traces a picture's samples; positions stay relative to the device's origin, other light goes to the film.
 
     The first `spp` of a pixel's `hits` primary hits send secondary rays, which make the buffer; light is to be gathered
-    at all of them. `with_gloss` records glossy primary hits too, with what their BSDFs need; else only diffuse ones.
+    at all of them. `with_gloss` records glossy primary hits too, with what their BSDFs need; else only diffuse ones;
+    `with_weight` what they reflect of their secondary rays' light, `with_beyond` the segments after mirrors too.
     """
     pixels = job.size[0] * job.size[1]
     scene = job.scene.scene
@@ -82,9 +85,11 @@ def trace_sample_buffer(
     for wanted, (more_of_hits, more_of_rays) in ((scene.moves, MOTION), (with_gloss, GLOSS)):
         if wanted:
             of_hits, of_rays = of_hits | more_of_hits, of_rays | more_of_rays
+    if with_weight:
+        of_rays["weight"] = wp.vec3
     if scene.camera.lens_radius > 0.0:
         of_hits["lens"] = wp.vec2
-    with_mirrors = with_gloss and scene.has_mirrors and not scene.moves
+    with_mirrors = with_gloss and with_beyond and scene.has_mirrors and not scene.moves
     if with_mirrors:
         of_rays |= BEYOND
     paths = path_settings(job, max_depth, roulette_depth, sampler, with_gloss)
@@ -262,9 +267,8 @@ def sample(
     job = Job(on_device, on_device.camera(size), size, checks.count("seed", seed, 0), where)
     if primary:
         return trace_primary_buffer(job, film, spp, depth, 5, Sampler.SOBOL)
-    samples, _ = trace_sample_buffer(
-        job, film, spp, spp, 1, depth, 5, Sampler.SOBOL, recursive, glossy and scene.is_glossy
-    )
+    with_gloss = glossy and scene.is_glossy
+    samples, _ = trace_sample_buffer(job, film, spp, spp, 1, depth, 5, Sampler.SOBOL, recursive, with_gloss, with_gloss)
     centre = on_device.centre.astype(np.float32)
     beyond = samples if samples.beyond is None else samples.beyond
     for points in {id(points): points for points in (samples.origin, samples.hit, beyond.origin, beyond.hit)}.values():

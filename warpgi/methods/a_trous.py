@@ -23,9 +23,9 @@ ROW_BYTES = 12 * 7 + 4 * 3
 class ATrous(SampleFilter):
     """À-Trous wavelet filter of indirect light (Dammertz et al. 2010): fast, blurs what features do not show.
 
-    Filters what diffuse surfaces reflect; what others do keeps its path-traced light. `gi.denoise` uses it on the
-    layers of any picture and filters every pixel with a surface. Without a colour term, as Lehtinen et al. 2012 have
-    it: that of the paper takes bright samples for edges and loses their energy.
+    Filters what diffuse surfaces reflect, with `glossy` glossy ones too; others keep their path-traced light.
+    `gi.denoise` uses it on the layers of any picture and filters every pixel with a surface. Without a colour term, as
+    Lehtinen et al. 2012 have it: that of the paper takes bright samples for edges and loses their energy.
 
     Raises:
         TypeError, ValueError: a setting is out of range.
@@ -44,9 +44,11 @@ class ATrous(SampleFilter):
     as reflections in metal, but loses light where there is more."""
     sigma_hit_normal: float | None = None
     """Difference of normals at the secondary hits at which a weight of the first pass falls to 1/e; halved from pass to
-    pass (Lehtinen et al. 2012). None: not looked at. For sample buffers alone; 4 is gentle."""
+    pass (Lehtinen et al. 2012). None: not looked at. For sample buffers alone; 4 is gentle, 1 keeps reflections."""
     demodulate: bool = True
     """Divide layers by albedo first, so that textures stay sharp; samples come without it."""
+    glossy: bool = False
+    """Filter what glossy surfaces reflect too, divided by their reflectance: less noise, and blurred reflections."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -54,6 +56,11 @@ class ATrous(SampleFilter):
         for name in ("sigma_normal", "sigma_position", "sigma_color", "sigma_hit_normal"):
             if getattr(self, name) is not None:
                 checks.number(name, getattr(self, name), 1e-6, 1e6)
+
+    @property
+    def filters_gloss(self) -> bool:
+        """Whether it filters what glossy surfaces reflect too."""
+        return self.glossy
 
     @property
     def kernels(self) -> tuple[wp.Kernel, ...]:

@@ -37,7 +37,7 @@ class RandomParameterFilter(SampleFilter):
 
     A cross-bilateral filter of samples whose weights follow, pixel by pixel, from the mutual information of colours
     and features with the random direction of the secondary ray and with screen position. Filters what diffuse surfaces
-    reflect; what others do keeps its path-traced light.
+    reflect, with `glossy` glossy ones too; others keep their path-traced light.
 
     Raises:
         TypeError, ValueError: a setting is out of range.
@@ -54,6 +54,8 @@ class RandomParameterFilter(SampleFilter):
     reinsert: bool = True
     """Give clamped light back within its pixel (Lehtinen et al. 2012), and what the weights lose or gain over the whole
     picture back by one factor a channel, so that the mean stays that of the input."""
+    glossy: bool = False
+    """Filter what glossy surfaces reflect too, divided by their reflectance: less noise, and blurred reflections."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -65,6 +67,11 @@ class RandomParameterFilter(SampleFilter):
         if self.neighbours is not None:
             checks.count("neighbours", self.neighbours, 1, 1 << 20)
         checks.number("variance", self.variance, 1e-6, 1e6)
+
+    @property
+    def filters_gloss(self) -> bool:
+        """Whether it filters what glossy surfaces reflect too."""
+        return self.glossy
 
     @property
     def kernels(self) -> tuple[wp.Kernel, ...]:
