@@ -226,7 +226,8 @@ NEAREST_IF_COVERING = (
                     found = block * 8 + j;
 """,
         FACING,
-    ).replace("(d2[j] > 0.0f) & ", "")
+        at_centre=True,
+    )
     + """
     const float* q = tree.blocks.data + (size_t)(found / 8) * 80 + found % 8 + 48;
     return found >= 0 && worst <= *q ? found : -1;
@@ -253,7 +254,8 @@ NEAREST_COVERING = (
 """,
         FACING + " & (m2[j] <= p[48 + j])",
         enter=" & (d2[j] == 0.0f)",
-    ).replace("(d2[j] > 0.0f) & ", "")
+        at_centre=True,
+    )
     + "    return found;\n"
 )
 

@@ -73,7 +73,7 @@ SEARCH_HEAD = (
                 const float along = dx * nx + dy * ny + dz * nz;
                 d2[j] = dx * dx + dy * dy + dz * dz;
                 m2[j] = d2[j] + stretch * along * along;
-                met[j] = (int)((p[48 + j] >= 0.0f) & (d2[j] > 0.0f) & (m2[j] < worst)ACCEPT);
+                met[j] = (int)((p[48 + j] >= 0.0f)APART & (m2[j] < worst)ACCEPT);
             }
             unsigned mask = lane_mask(met);
             while (mask) {
@@ -120,11 +120,14 @@ SEARCH_TAIL = """
 """
 
 
-def search(keep: str, accept: str = "", node: str = "", enter: str = "", block: str = "") -> str:
+def search(
+    keep: str, accept: str = "", node: str = "", enter: str = "", block: str = "", at_centre: bool = False
+) -> str:
     """Native code of the search: what to do with a lane and a further test of lanes; what to do at a node and a further
-    test of its children; what to do at a block."""
+    test of its children; what to do at a block; whether what lies at the very centre is found too."""
     head, tail = SEARCH_HEAD, SEARCH_TAIL
-    for name, code in (("ACCEPT", accept), ("BLOCK", block), ("NODE", node), ("ENTER", enter)):
+    apart = "" if at_centre else " & (d2[j] > 0.0f)"
+    for name, code in (("ACCEPT", accept), ("BLOCK", block), ("NODE", node), ("ENTER", enter), ("APART", apart)):
         head, tail = head.replace(name, code), tail.replace(name, code)
     return head + keep + tail
 
