@@ -255,6 +255,16 @@ def test_one_frame_stays_as_it_is():
     np.testing.assert_allclose(result, frame.clip(0.0), rtol=1e-5, atol=1e-6)
 
 
+def test_pixels_that_are_no_numbers_are_counted():
+    """They come out as black at the worst, and every frame says how many it had."""
+    frames = smooth_images(4)
+    frames[1][2, 3, 0], frames[1][5, 5], frames[2][0, 0, 1] = np.nan, np.inf, -np.inf
+    result = gi.filter_animation(animation_of(frames))
+    assert np.isfinite(result.stack("indirect")).all()
+    assert [result[k].counts.get("nonfinite_pixels", 0) for k in range(4)] == [0, 2, 1, 0]
+    assert result.counts["nonfinite_pixels"] == 3
+
+
 def test_more_frames_than_pixels():
     """A picture of four pixels over fifty frames is filtered too, and a still one comes to its mean."""
     noisy = 5.0 + noise((50, 2, 2, 3), 0.2)

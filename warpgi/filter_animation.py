@@ -59,7 +59,8 @@ def filter_animation(
 
     Returns:
         The frames, the filtered layer in place of its input and without "variance", which they no longer have; and
-        `modes`, the basis functions and truncations.
+        `modes`, the basis functions and truncations. Pixels that were not finite count as black, and in
+        `counts["nonfinite_pixels"]`.
 
     Raises:
         TypeError, ValueError: an argument is wrong or a layer is missing.
@@ -154,6 +155,7 @@ class FilterRun:
         self.height, self.width = first.image.shape[:2]
         self._features = FeatureMeans()
         self._identities: dict[int, str] = {}
+        self._nonfinite: dict[int, int] = {}  # pixels, by frame
         size = (self.width, self.height)
         with self.timings.stage("filter"):
             matrix = FrameMatrix(self._load, len(noisy), size, device)
@@ -184,9 +186,10 @@ class FilterRun:
         if self.layer == "indirect" and "image" in layers:
             layers["image"] = layers["image"] + (values - layers["indirect"])
         layers[self.layer] = values
+        lost = self._nonfinite[index]
         result = Render(
             layers,
-            counts=picture.counts,
+            counts=picture.counts | ({"nonfinite_pixels": lost} if lost else {}),
             spp=picture.spp,
             scene=picture.scene,
             **provenance(self.method, picture.seed, self.device),
@@ -204,7 +207,9 @@ class FilterRun:
             if index not in self._identities:
                 self._features.add(picture)
                 self._identities[index] = picture.identity or fingerprint(values)
-            return np.where(np.isfinite(values), values, np.float32(0.0))
+            finite = np.isfinite(values)
+            self._nonfinite[index] = int(np.count_nonzero(~finite.all(axis=2)))
+            return np.where(finite, values, np.float32(0.0))
 
 
 def high_share(truncation: np.ndarray, method: StatisticalFilter) -> np.ndarray:
