@@ -16,6 +16,7 @@ from bench.mitsuba_peer import MissingPeer
 from bench.point_animations import filtered_points
 from bench.reference import Reference, make_reference
 from bench.report import circumstances, finite, progress
+from warpgi import checks
 from warpgi.filter_animation import FilterRun
 from warpgi.frame_renderer import FrameRenderer
 from warpgi.image import atomic_write, check_output
@@ -57,6 +58,7 @@ def run(contest: Contest, json: Path | None, picture: Path | None) -> list[Stand
 
     if picture is not None:
         check_output(picture)
+    checks.image_size(contest.size)
     device = gi.Device(contest.device)
     frames = {} if contest.frames is None else {"frames": contest.frames}
     sequence = gi.scenes.build_sequence(contest.scene, **frames)

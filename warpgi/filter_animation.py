@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import os
-import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,10 +13,10 @@ from warpgi.animation import Animation, frame_layer
 from warpgi.cluster import Cluster, open_cluster
 from warpgi.device import Device, as_device
 from warpgi.fingerprint import fingerprint
-from warpgi.frame_files import FrameFiles
+from warpgi.frame_files import FrameFiles, make_frames
 from warpgi.kernels import irradiance_filter, statistical_filter
 from warpgi.methods.statistical_filter import StatisticalFilter
-from warpgi.progress import Progress, progress_bar
+from warpgi.progress import Progress
 from warpgi.render import provenance
 from warpgi.result import Render
 from warpgi.statistical_filtering import FrameMatrix, PixelSmoother, Projection
@@ -105,24 +103,8 @@ def filter_frames(
     if resume and files is None:
         raise ValueError("resume is True, expected False where out is None: there are no files to go on from")
     run = FilterRun(noisy, method, device, resample, cluster)
-    sources: list[Render | Path] = []
-    rendered: list[int] = []
     counts: Counter[str] = Counter()
-    began = time.perf_counter()
-    with progress_bar(progress) as report:
-        for index, number in enumerate(noisy.frames):
-            identity = fingerprint(run.identity, number)
-            picture = files.find(number, identity) if files and resume else None
-            if picture is None:
-                picture = run.frame(index)
-                rendered.append(number)
-                if files:
-                    with run.timings.stage("image"):
-                        files.save(number, identity, picture)
-            counts.update(picture.counts)
-            sources.append(picture if files is None else files.path(number))
-            if report is not None:
-                report(Progress(index + 1, len(noisy), "frames", time.perf_counter() - began, dict(counts)))
+    sources, rendered = make_frames(noisy.frames, run.identity, run.frame, files, resume, run.timings, counts, progress)
     if files:
         run.modes.save(files.path(noisy.frames[0]).with_name(MODES))
     return Animation(sources, noisy.frames, noisy.fps, dict(run.timings), dict(counts), tuple(rendered), run.modes)

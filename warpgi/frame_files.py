@@ -1,13 +1,18 @@
-"""The files of an animation: one a frame, each of which says what it is of."""
+"""The files of an animation: one a frame, each of which says what it is of; and the loop that makes them."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+import time
+from collections import Counter
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
+from warpgi.fingerprint import fingerprint
 from warpgi.image import PathLike, check_output
+from warpgi.progress import Progress, progress_bar
 from warpgi.result import Render
+from warpgi.timing import Timings
 
 
 def frame_path(pattern: PathLike) -> Callable[[int], Path]:
@@ -63,3 +68,50 @@ class FrameFiles:
         picture.identity = identity
         picture.timings = {}
         picture.save(self.path(number))
+
+
+def make_frames(
+    numbers: Sequence[int],
+    identity: str,
+    make: Callable[[int], Render],
+    files: FrameFiles | None,
+    resume: bool,
+    timings: Timings,
+    counts: Counter[str],
+    progress: bool | Callable[[Progress], None],
+    uncounted: Collection[str] = (),
+) -> tuple[list[Render | Path], list[int]]:
+    """Makes pictures of a run that has all frames at hand, and writes them where there are files.
+
+    Args:
+        numbers: of the frames.
+        identity: digest of all that the pictures depend on, but for the number.
+        make: gives the picture of a frame, by its place in `numbers`.
+        files: where pictures go; None keeps them.
+        resume: take files that are whole and of these frames.
+        timings: what writing took is added, as "image".
+        counts: those of all pictures are added.
+        progress: as `render_animation` takes it.
+        uncounted: names of counts that are left out.
+
+    Returns:
+        Pictures or their files, and the numbers of those that were made.
+    """
+    sources: list[Render | Path] = []
+    made: list[int] = []
+    began = time.perf_counter()
+    with progress_bar(progress) as report:
+        for index, number in enumerate(numbers):
+            own = fingerprint(identity, number)
+            picture = files.find(number, own) if files and resume else None
+            if picture is None:
+                picture = make(index)
+                made.append(number)
+                if files:
+                    with timings.stage("image"):
+                        files.save(number, own, picture)
+            counts.update({name: count for name, count in picture.counts.items() if name not in uncounted})
+            sources.append(picture if files is None else files.path(number))
+            if report is not None:
+                report(Progress(index + 1, len(numbers), "frames", time.perf_counter() - began, dict(counts)))
+    return sources, made

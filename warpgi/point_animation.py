@@ -22,7 +22,7 @@ from warpgi.device_scene import DeviceScene
 from warpgi.film import Film
 from warpgi.filter_animation import MODES
 from warpgi.fingerprint import fingerprint
-from warpgi.frame_files import FrameFiles
+from warpgi.frame_files import FrameFiles, make_frames
 from warpgi.frame_renderer import frame_seed
 from warpgi.image import atomic_write
 from warpgi.job import Job
@@ -72,23 +72,10 @@ def render_points(
             if report is not None:
                 report(Progress(done, len(numbers), "frames of light", time.perf_counter() - began, dict(run.counts)))
     run.filter()
-    sources: list[Render | Path] = []
-    rendered: list[int] = []
-    began = time.perf_counter()
-    with progress_bar(progress) as report:
-        for index, number in enumerate(numbers):
-            identity = fingerprint(run.identity, number)
-            picture = files.find(number, identity) if files and resume else None
-            if picture is None:
-                picture = run.picture(index)
-                rendered.append(number)
-                if files:
-                    with run.timings.stage("image"):
-                        files.save(number, identity, picture)
-            run.counts.update({name: count for name, count in picture.counts.items() if name != "points"})
-            sources.append(picture if files is None else files.path(number))
-            if report is not None:
-                report(Progress(index + 1, len(numbers), "frames", time.perf_counter() - began, dict(run.counts)))
+    # points are counted once, not by every picture that they light
+    sources, rendered = make_frames(
+        numbers, run.identity, run.picture, files, resume, run.timings, run.counts, progress, uncounted=("points",)
+    )
     if files:
         run.modes.save(files.path(numbers[0]).with_name(MODES))
     return Animation(sources, numbers, sequence.fps, dict(run.timings), dict(run.counts), tuple(rendered), run.modes)
